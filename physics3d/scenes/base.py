@@ -1,0 +1,91 @@
+"""A capture: everything that is known about a scene before anything is computed. Metres, z up, whatever the source used."""
+
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from physics3d.artifact import AbstractArtifact, require_finite
+from physics3d.gaussians.cameras import Camera
+from physics3d.gaussians.model import Gaussians
+from physics3d.mpm.boundaries.base import AbstractBoundary
+
+
+@dataclass(frozen=True, kw_only=True)
+class Take:
+    """One recorded motion, seen by one or more fixed cameras at the same instants; frame 0 is the captured rest state."""
+
+    name: str
+    role: str  # "learn" or "evaluate"
+    fps: float  # [1/s]
+    cameras: tuple[Camera, ...]
+    videos: tuple[
+        Tensor, ...
+    ]  # uint8 [t, h, w, 3], one per camera, composited on Capture.background where there is a matte
+    excitation: tuple[AbstractBoundary, ...] = ()  # what set it in motion (a poke); gravity and floors are in the World
+    held_out_cameras: tuple[int, ...] = ()  # cameras used by evaluation only, although the take is learned from
+
+
+@dataclass(frozen=True, kw_only=True)
+class Capture(AbstractArtifact):
+    name: str
+    images: tuple[Tensor, ...]  # uint8 [h, w, 3]; sizes may differ; composited on `background` where there is alpha
+    cameras: tuple[Camera, ...]  # one per image
+    names: tuple[str, ...]  # one per image: the file it came from, or a synthetic name
+    held_out: tuple[int, ...] = ()  # images never trained on
+    alphas: tuple[Tensor, ...] = ()  # uint8 [h, w], one per image or none: the matte of the object
+    background: tuple[float, float, float] = (1.0, 1.0, 1.0)  # colour behind everything, 0..1
+    points: Tensor | None = None  # [m, 3] [m], from structure from motion
+    point_colors: Tensor | None = None  # [m, 3] in 0..1
+    takes: tuple[Take, ...] = ()
+    gaussians: Gaussians | None = None  # a trained model, if the capture is one: reconstruction is then left out
+    single_object: bool = False  # one object on a plain background: segmentation is then left out
+    truth: dict[str, float] = field(default_factory=dict)  # material parameters, SI, named as in the material
+    truth_source: str = ""  # where `truth` comes from, and how far to trust it
+    note: str = ""  # said at the start of every run, e.g. that this is a synthetic twin
+
+    def check(self) -> None:
+        n = len(self.images)
+        if n == 0 and self.gaussians is None:
+            raise ValueError(f"capture {self.name}: no images; check the folder in the scene's configuration")
+        if not len(self.cameras) == len(self.names) == n:
+            raise ValueError(
+                f"capture {self.name}: {n} images, {len(self.cameras)} cameras, {len(self.names)} names; must be equal"
+            )
+        if self.alphas and len(self.alphas) != n:
+            raise ValueError(f"capture {self.name}: {len(self.alphas)} alphas for {n} images; give one each or none")
+        for name, image, camera in zip(self.names, self.images, self.cameras):
+            camera.check(name)
+            if image.dtype != torch.uint8 or tuple(image.shape) != (camera.height, camera.width, 3):
+                raise ValueError(
+                    f"{name}: image is {tuple(image.shape)} {image.dtype}, its camera says {camera.height} x {camera.width}; "
+                    "camera file and images disagree"
+                )
+        if n and len(set(self.held_out)) >= n:
+            raise ValueError(f"capture {self.name}: all {n} images are held out; leave some to train on")
+        if self.points is not None:
+            require_finite(f"capture {self.name}: points", self.points)
+        for take in self.takes:
+            if take.role not in ("learn", "evaluate") or len(take.cameras) != len(take.videos):
+                raise ValueError(
+                    f"take {take.name}: role {take.role!r} must be learn or evaluate, with one video per camera"
+                )
+
+    def take(self, role: str) -> Take | None:
+        """The first take of that role, or None."""
+        return next((t for t in self.takes if t.role == role), None)
+
+
+class AbstractSource:
+    """A frozen dataclass whose fields are paths and options, and whose call returns a Capture.
+
+    Raises ValueError (naming file and remedy) on a missing folder, no images, a broken image, or cameras and images that
+    disagree. `files()` lists what is read, so that the pipeline can fingerprint the content.
+    """
+
+    def files(self) -> tuple[str, ...]:
+        """Every file that the capture depends on; none for a scene made by code."""
+        raise NotImplementedError
+
+    def __call__(self, *, log) -> Capture:
+        raise NotImplementedError
