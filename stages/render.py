@@ -1,0 +1,67 @@
+"""Trajectory + Gaussians -> video, seen by the cameras of the recording or by a view of the capture."""
+
+from dataclasses import dataclass
+
+import torch
+
+from physics3d.filling import Body
+from physics3d.gaussians.cameras import Camera
+from physics3d.gaussians.deform import render_deformed
+from physics3d.gaussians.model import Gaussians
+from physics3d.log import Log
+from physics3d.mpm.rollout import Trajectory
+from physics3d.scenes.base import Capture
+from physics3d.video import Video, contact_sheet, space_time_slice, to_uint8, write_mp4
+
+
+@dataclass(frozen=True, kw_only=True)
+class Render:
+    """Renders every frame of a trajectory.
+
+    With a recorded motion, its cameras are used: of the take to evaluate on if there is one, else those of the take to
+    learn from that were held out. A capture without takes is seen from `view`.
+    """
+
+    view: int | str | None = None  # index or name of the photograph whose camera is used; None: the first one
+    scale: float = 1.0  # pixels of the video per pixel of the camera, along each side
+    device: str = "cpu"
+
+    def __call__(
+        self, capture: Capture, gaussians: Gaussians, body: Body, trajectory: Trajectory, *, log: Log
+    ) -> Video:
+        """Returns one video per camera. Raises ValueError if `view` is not in the capture."""
+        cameras = self.cameras(capture)
+        model = gaussians.to(self.device)
+        embedding = body.embedding.to(self.device)
+        rest = trajectory.rest_position.to(self.device)
+        background = torch.tensor(capture.background, device=self.device)
+        videos: dict[str, list[torch.Tensor]] = {name: [] for name in cameras}
+        count = len(trajectory.position)
+        for x, F in log.progress(zip(trajectory.position, trajectory.deformation), "render", total=count):
+            x, F = x.to(self.device), F.to(self.device)
+            for name, camera in cameras.items():
+                with torch.no_grad():
+                    image = render_deformed(model, embedding, rest, x, F, camera, background=background)
+                videos[name].append(to_uint8(image.color))
+        frames = {name: torch.stack(images) for name, images in videos.items()}
+        for name, video in frames.items():
+            write_mp4(log.path(f"{name}.mp4"), video, trajectory.fps)
+            log.image(f"{name}_frames", contact_sheet(video))
+            log.image(f"{name}_space_time", space_time_slice(video, row=video.shape[1] // 2))
+        log.info(f"{count} frames from {len(frames)} camera(s): {', '.join(f'{name}.mp4' for name in frames)}")
+        return Video(frames=tuple(frames.values()), names=tuple(frames), fps=trajectory.fps)
+
+    def cameras(self, capture: Capture) -> dict[str, Camera]:
+        """The cameras of the video by name; `camera<i>` is number i of the take."""
+        take = capture.take("evaluate") or capture.take("learn")
+        if take is not None:
+            picks = take.held_out_cameras or range(len(take.cameras))
+            return {f"camera{i}": take.cameras[i].scaled(self.scale) for i in picks}
+        view = 0 if self.view is None else self.view
+        if isinstance(view, str):
+            if view not in capture.names:
+                raise ValueError(f"render.view is {view!r}; the photographs are {', '.join(capture.names[:8])}, ...")
+            view = capture.names.index(view)
+        if not 0 <= view < len(capture.cameras):
+            raise ValueError(f"render.view is {view}; the capture has views 0 to {len(capture.cameras) - 1}")
+        return {"view": capture.cameras[view].scaled(self.scale)}
