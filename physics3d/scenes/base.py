@@ -1,4 +1,4 @@
-"""A capture: everything that is known about a scene before anything is computed. Metres, z up, whatever the source used."""
+"""A capture: all that is known about a scene before anything is computed. Metres, z up, whatever the source used."""
 
 from dataclasses import dataclass, field
 
@@ -13,7 +13,7 @@ from physics3d.mpm.boundaries.base import AbstractBoundary
 
 @dataclass(frozen=True, kw_only=True)
 class Take:
-    """One recorded motion, seen by one or more fixed cameras at the same instants; frame 0 is the captured rest state."""
+    """One recorded motion, seen by one or more fixed cameras at the same instants; frame 0 is the rest state."""
 
     name: str
     role: str  # "learn" or "evaluate"
@@ -58,8 +58,8 @@ class Capture(AbstractArtifact):
             camera.check(name)
             if image.dtype != torch.uint8 or tuple(image.shape) != (camera.height, camera.width, 3):
                 raise ValueError(
-                    f"{name}: image is {tuple(image.shape)} {image.dtype}, its camera says {camera.height} x {camera.width}; "
-                    "camera file and images disagree"
+                    f"{name}: image is {tuple(image.shape)} {image.dtype}, its camera says "
+                    f"{camera.height} x {camera.width}; camera file and images disagree"
                 )
         if n and len(set(self.held_out)) >= n:
             raise ValueError(f"capture {self.name}: all {n} images are held out; leave some to train on")
@@ -79,8 +79,8 @@ class Capture(AbstractArtifact):
 class AbstractSource:
     """A frozen dataclass whose fields are paths and options, and whose call returns a Capture.
 
-    Raises ValueError (naming file and remedy) on a missing folder, no images, a broken image, or cameras and images that
-    disagree. `files()` lists what is read, so that the pipeline can fingerprint the content.
+    Raises ValueError (naming file and remedy) on a missing folder, no images, a broken image, or cameras and images
+    that disagree. `files()` lists what is read, so that the pipeline can fingerprint the content.
     """
 
     def files(self) -> tuple[str, ...]:

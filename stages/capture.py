@@ -1,0 +1,50 @@
+"""The first stage: whatever the scene's source is -> a Capture, with pictures of what was read."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from physics3d.scenes.base import AbstractSource, Capture
+from physics3d.video import contact_sheet, write_mp4
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoadCapture:
+    """Call the source, say what came back, and keep previews of the views and of every take."""
+
+    source: AbstractSource
+
+    def __call__(self, *, log) -> Capture:
+        capture = self.source(log=log)
+        capture.check()
+        if capture.note:
+            log.info(capture.note)
+        training = len(capture.images) - len(set(capture.held_out))
+        log.metric("views", training)
+        log.metric("views_held_out", len(set(capture.held_out)))
+        log.metric("points", 0 if capture.points is None else len(capture.points))
+        if capture.images:
+            h, w = capture.images[0].shape[:2]
+            log.info(f"{training} views to train on, {len(set(capture.held_out))} held out, {w} x {h} pixels")
+            log.image("views", contact_sheet(_same_size(capture.images), columns=5, count=15))
+        if capture.points is not None:
+            extent = capture.points.quantile(0.95, dim=0) - capture.points.quantile(0.05, dim=0)
+            log.info(
+                f"{len(capture.points)} points; nine tenths of them within {' x '.join(f'{e:.3g}' for e in extent)} m"
+            )
+        for take in capture.takes:
+            t = len(take.videos[0])
+            log.info(f"take {take.name} ({take.role}): {t} frames at {take.fps:g} fps from {len(take.cameras)} cameras")
+            log.image(f"take_{take.name}", contact_sheet(take.videos[0]))
+            if log.folder is not None:
+                write_mp4(log.path(f"previews/take_{take.name}.mp4"), take.videos[0], take.fps)
+        return capture
+
+
+def _same_size(images: tuple[Tensor, ...]) -> Tensor:
+    """[n, h, w, 3] with the height of the smallest; each is stretched by nearest pixels where sizes differ."""
+    h, w = min((tuple(i.shape[:2]) for i in images), default=(1, 1))
+    rows = [torch.arange(h) * i.shape[0] // h for i in images]
+    columns = [torch.arange(w) * i.shape[1] // w for i in images]
+    return torch.stack([i[r][:, c] for i, r, c in zip(images, rows, columns)])
