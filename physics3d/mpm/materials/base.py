@@ -1,0 +1,104 @@
+"""What a constitutive model is to the solver: data, a parameter map and one Warp function.
+
+A model receives the velocity gradient L [1/s] of one particle over one substep and answers with the new elastic
+deformation and the Kirchhoff stress tau = J sigma [Pa]. Deformation is stored as its deviation from the identity,
+H = F - I, so that float32 keeps small strains. The solver never asks which model it has.
+"""
+
+import abc
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+import warp as wp
+from jaxtyping import Float
+from torch import Tensor
+
+Values = dict[str, Tensor]  # physical name -> scalar or one number per particle, SI
+
+
+@dataclass(frozen=True, kw_only=True)
+class AbstractMaterial(abc.ABC):
+    """A constitutive model. Its fields choose the model; its parameters are the numbers that one learns."""
+
+    plastic: ClassVar[bool] = False  # True: H is elastic only, the solver keeps the total deformation beside it
+
+    @property
+    @abc.abstractmethod
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the physical parameters, SI."""
+
+    @property
+    def memory_rows(self) -> int:
+        """Internal variables per particle."""
+        return 0
+
+    @abc.abstractmethod
+    def check_parameters(self, values: Values) -> None:
+        """Raise ValueError naming the parameter, its value and the remedy."""
+
+    @abc.abstractmethod
+    def coefficients(self, values: Values) -> Float[Tensor, "k n"]:
+        """Checked physical parameters -> rows the Warp function reads; differentiable. n = 1 if all are scalars."""
+
+    @abc.abstractmethod
+    def wave_modulus(self, coefficients: Float[Tensor, "k n"]) -> Float[Tensor, " n"]:
+        """lam + 2 mu at rest, all branches stiff [Pa]: rho c^2 of the fastest wave."""
+
+    @abc.abstractmethod
+    def energy(
+        self, coefficients: Float[Tensor, "k n"], H: Float[Tensor, "n 3 3"], memory: Float[Tensor, "m n"]
+    ) -> Float[Tensor, " n"]:
+        """Stored elastic energy per volume of the rest state [J/m^3]; its derivative d psi/dF F^T is the stress."""
+
+    def initial_memory(self, n: int, dtype: torch.dtype) -> Float[Tensor, "m n"]:
+        """Internal variables of the undeformed state (deviations from it, hence zeros)."""
+        return torch.zeros((self.memory_rows, n), dtype=dtype)
+
+    @abc.abstractmethod
+    def advance(self, real: type) -> wp.Function:
+        """The Warp function for `real` = wp.float32 or wp.float64, the same object at every call:
+
+            advance(p: int, dt: real, L: mat33, H: mat33, coefficients: array2d[k, n], memory: array2d[m, n],
+                    memory_next: array2d[m, n]) -> (H_next: mat33, tau: mat33)
+
+        It reads column p of coefficients and memory, writes all rows of column p of memory_next, and has an exact
+        adjoint. dt = 0 and L = 0 give the rate-independent stress of the present state.
+        """
+
+
+def check_names(values: Values, parameters: tuple[str, ...]) -> None:
+    """Raise ValueError unless `values` has exactly the names in `parameters`."""
+    missing, unknown = set(parameters) - set(values), set(values) - set(parameters)
+    if missing or unknown:
+        need = ", ".join(parameters)
+        raise ValueError(f"material parameters: missing {sorted(missing)}, unknown {sorted(unknown)}; needed: {need}")
+
+
+def check_range(values: Values, name: str, lowest: float, highest: float = math.inf, *, closed: bool = False) -> None:
+    """Raise ValueError unless lowest < values[name] < highest (closed: <=); NaN never passes."""
+    value = torch.as_tensor(values[name]).detach()
+    good = (value >= lowest) & (value <= highest) if closed else (value > lowest) & (value < highest)
+    if not bool(good.all()):
+        worst = value[~good].flatten()[0].item()
+        less = "<=" if closed else "<"
+        raise ValueError(f"{name} is {worst:g}; take {lowest:g} {less} {name} {less} {highest:g}")
+
+
+def check_elastic(values: Values) -> None:
+    """Raise ValueError unless youngs_modulus [Pa] is positive and poissons_ratio lies in (-1, 0.5)."""
+    check_range(values, "youngs_modulus", 0.0)
+    check_range(values, "poissons_ratio", -1.0, 0.5)
+
+
+def lame(youngs_modulus: Tensor, poissons_ratio: Tensor) -> tuple[Tensor, Tensor]:
+    """(mu, lam) [Pa] of Young's modulus [Pa] and Poisson's ratio."""
+    mu = youngs_modulus / (2 * (1 + poissons_ratio))
+    lam = youngs_modulus * poissons_ratio / ((1 + poissons_ratio) * (1 - 2 * poissons_ratio))
+    return mu, lam
+
+
+def rows(*values: Tensor) -> Float[Tensor, "k n"]:
+    """Stack scalars and per-particle values as rows of one matrix."""
+    return torch.stack(torch.broadcast_tensors(*(torch.atleast_1d(torch.as_tensor(value)) for value in values)))
