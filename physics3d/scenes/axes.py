@@ -55,9 +55,8 @@ class Axes:
         """Say which way the photographer held the camera on average: the best guess where the source has no up."""
         down = torch.stack([c.world_to_camera[1, :3] for c in cameras]).mean(0)
         up = -self.rotation().T @ down / down.norm()
-        log.info(
-            f"cameras' mean up in the source's axes is [{up[0]:.3f}, {up[1]:.3f}, {up[2]:.3f}]; up is set to {[*self.up]}"
-        )
+        mean = ", ".join(f"{u:.3f}" for u in up)
+        log.info(f"cameras' mean up in the source's axes is [{mean}]; up is set to {[*self.up]}")
 
 
 def rigid_inverse(pose: Float64[Tensor, "4 4"], name: str) -> Float64[Tensor, "4 4"]:
