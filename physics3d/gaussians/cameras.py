@@ -55,7 +55,7 @@ class Camera:
         return uv, depth
 
     def rays(self, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Tensor]:
-        """Origin [3] and unscaled directions [h, w, 3] through the pixel centres; depth along the axis is the parameter."""
+        """Origin [3] and unscaled directions [h, w, 3] through pixel centres; the parameter is depth along the axis."""
         v, u = torch.meshgrid(
             torch.arange(self.height, dtype=dtype) + 0.5, torch.arange(self.width, dtype=dtype) + 0.5, indexing="ij"
         )

@@ -1,19 +1,23 @@
-"""Differentiable splatting of 3D Gaussians by EWA in tiles (Zwicker et al. 2001; Kerbl et al. 2023); one source for CPU and CUDA.
+"""Differentiable splatting of 3D Gaussians by EWA in tiles (Zwicker et al. 2001; Kerbl et al. 2023), CPU and CUDA.
 
     project   u = fx X/Z + cx, v = fy Y/Z + cy,   Sigma' = J R Sigma R^T J^T + 0.3 px^2 I          [px], [px^2]
     weigh     alpha_i = min(o_i exp(-1/2 d^T Sigma'^-1 d), 0.999),   0 where below 1/255
     blend     w_i = T_i alpha_i,  T_{i+1} = T_i (1 - alpha_i), front to back, until T < 1e-4
     give      color = sum w c + T_end background,   alpha = 1 - T_end,   depth = sum w z / sum w    [m]
 
-A thread owns a square of pixels and walks the depth-ordered list of its tile: Gaussians outside, pixels inside. On a CPU the
-square is the whole tile (a Warp kernel runs there on one thread, so each core gets a share of the tiles); on CUDA it is one
-pixel. Blending's adjoint is written by hand: it walks the same list front to back once more and needs only the remaining
-sum of what lies behind. The adjoint of the projection is Warp's. `twin.py` says the same in plain torch, and the tests compare.
+A thread owns a square of pixels and walks the depth-ordered list of its tile: Gaussians outside, pixels inside. On a
+CPU the square is the whole tile (a Warp kernel runs there on one thread, so each core gets a share of the tiles); on CUDA
+it is one pixel. Blending's adjoint is written by hand: it walks the same list front to back once more and needs only the
+remaining sum of what lies behind. The adjoint of the projection is Warp's. `twin.py` says the same in plain torch, and
+the tests compare.
 """
+
+# ruff: noqa: UP018, RUF046 (in a Warp kernel a literal is a constant, float(0.0) is a variable)
 
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 import warp as wp
@@ -48,14 +52,20 @@ def rasterize(
     color: Float[Tensor, "n 3"],
     camera: Camera,
     *,
-    background: Float[Tensor, " 3"],
+    background: Float[Tensor, " 3"] | tuple[float, float, float],
 ) -> Rendered:
     """Draw Gaussians with means [m], covariances [m^2], opacities and colours in 0..1. Computes in float32.
 
-    Differentiable in the first four arguments and the background. Raises ValueError for wrong shapes or non-finite numbers.
+    Differentiable in the first four arguments and the background. Raises ValueError for wrong shapes or non-finite
+    numbers.
     """
     n = len(mean)
-    shapes = {"mean": (mean, (n, 3)), "covariance": (covariance, (n, 3, 3)), "opacity": (opacity, (n,)), "color": (color, (n, 3))}
+    shapes = {
+        "mean": (mean, (n, 3)),
+        "covariance": (covariance, (n, 3, 3)),
+        "opacity": (opacity, (n,)),
+        "color": (color, (n, 3)),
+    }
     for name, (value, shape) in shapes.items():
         if tuple(value.shape) != shape:
             raise ValueError(f"rasterize: {name} has shape {tuple(value.shape)}, expected {shape}")
@@ -64,19 +74,25 @@ def rasterize(
     alpha = 1 - clear
     seen = alpha > 0
     depth = torch.where(seen, blended[..., 3] / torch.where(seen, alpha, 1), 0)
-    return Rendered(color=blended[..., :3] + clear[..., None] * background.to(blended), alpha=alpha, depth=depth)
+    return Rendered(
+        color=blended[..., :3] + clear[..., None] * torch.as_tensor(background).to(blended), alpha=alpha, depth=depth
+    )
 
 
 def contribution(gaussians: Gaussians, camera: Camera, masks: Float[Tensor, "m h w"]) -> Float[Tensor, "n m"]:
     """Sum over pixels of (blending weight of a Gaussian x mask): how much each Gaussian adds to each mask [px]."""
     if masks.shape[1:] != (camera.height, camera.width):
-        raise ValueError(f"contribution: masks are {tuple(masks.shape[1:])} pixels, the camera {camera.height, camera.width}")
+        raise ValueError(
+            f"contribution: masks are {tuple(masks.shape[1:])} pixels, the camera {camera.height, camera.width}"
+        )
     with torch.no_grad():
         g = gaussians.to(gaussians.mean.device, torch.float32)
         state = _project(g.mean, g.covariance(), g.opacity, torch.zeros_like(g.mean), camera)
         blended, clear = _blend(state)
         weight = []
-        for some in masks.to(g.mean).split(3):  # the adjoint of colour is the sum of weights times the adjoint of the image
+        for some in masks.to(g.mean).split(
+            3
+        ):  # the adjoint of colour is the sum of weights times the adjoint of the image
             image_bar = torch.zeros_like(blended)
             image_bar[..., : len(some)] = some.permute(1, 2, 0)
             sums = _blend_adjoint(state, blended, clear, image_bar, torch.zeros_like(clear))
@@ -84,7 +100,7 @@ def contribution(gaussians: Gaussians, camera: Camera, masks: Float[Tensor, "m h
     return torch.cat(weight, -1)
 
 
-# ---------------------------------------------------------------------------------------------------------------- kernels
+# -------------------------------------------------------------------------------------------------------- kernels
 
 
 @wp.struct
@@ -352,7 +368,7 @@ def blend_adjoint(
                 wp.atomic_add(sums, part, g, 6 + j, c_bar[j])
 
 
-# ----------------------------------------------------------------------------------------------------------- torch <-> Warp
+# -------------------------------------------------------------------------------------------------- torch <-> Warp
 
 
 @dataclass(frozen=True)
@@ -385,7 +401,7 @@ def _warp(tensor: Tensor, dtype=None) -> wp.array:
 
 
 def _project(mean: Tensor, covariance: Tensor, opacity: Tensor, color: Tensor, camera: Camera) -> _State:
-    wp.config.quiet = True
+    wp.config.log_level = wp.LOG_WARNING
     wp.init()
     n, device = len(mean), mean.device
     mean, covariance, opacity, color = (a.detach().contiguous() for a in (mean, covariance, opacity, color))
@@ -424,11 +440,11 @@ def _shares(state: _State) -> tuple[int, list[tuple[int, int]]]:
     work = state.start.long() + 8 * torch.arange(tiles + 1)
     cuts = torch.searchsorted(work, torch.arange(1, cores) * int(work[-1]) // cores).tolist()
     edges = [0, *cuts, tiles]
-    return TILE, list(zip(edges[:-1], edges[1:]))
+    return TILE, list(pairwise(edges))
 
 
 def _launch(kernel, shares: list[tuple[int, int]], inputs, outputs, device) -> None:
-    """Launch one share after the other; on a CPU at once, from Python threads, because a launch there releases the GIL."""
+    """Launch all shares; several at once from Python threads, because a launch on a CPU releases the GIL."""
 
     def one(part: int, begin: int, end: int) -> None:
         wp.launch(kernel, end - begin, inputs(part, begin), outputs, device=device)
@@ -436,7 +452,6 @@ def _launch(kernel, shares: list[tuple[int, int]], inputs, outputs, device) -> N
     if len(shares) == 1:
         one(0, *shares[0])
         return
-    wp.load_module(device=device, module=__name__)
     with ThreadPoolExecutor(len(shares)) as pool:
         list(pool.map(one, range(len(shares)), *zip(*shares)))
 
@@ -486,7 +501,10 @@ class _Splat(torch.autograd.Function):
             len(state.mean),
             inputs=[_warp(state.mean, wp.vec3), _warp(state.covariance, wp.mat33), _warp(state.opacity), state.view],
             outputs=[
-                _warp(state.center, wp.vec3), _warp(state.conic, wp.vec3), _warp(state.tiles, wp.vec4i), _warp(state.count)
+                _warp(state.center, wp.vec3),
+                _warp(state.conic, wp.vec3),
+                _warp(state.tiles, wp.vec4i),
+                _warp(state.count),
             ],
             adj_inputs=[_warp(mean_bar, wp.vec3), _warp(covariance_bar, wp.mat33), _warp(opacity_bar), View()],
             adj_outputs=[_warp(center_bar, wp.vec3), _warp(conic_bar, wp.vec3), None, None],

@@ -38,7 +38,9 @@ def rasterize_plainly(
     conic = torch.linalg.inv((flat + flat.mT) / 2)
 
     row, column = torch.meshgrid(torch.arange(h).to(mean) + 0.5, torch.arange(w).to(mean) + 0.5, indexing="ij")
-    d = torch.stack([column - (camera.fx * x + camera.cx)[:, None, None], row - (camera.fy * y + camera.cy)[:, None, None]], -1)
+    d = torch.stack(
+        [column - (camera.fx * x + camera.cx)[:, None, None], row - (camera.fy * y + camera.cy)[:, None, None]], -1
+    )
     e = 0.5 * torch.einsum("nhwi,nij,nhwj->nhw", d, conic, d)
     alpha = (opacity[:, None, None] * torch.exp(-e)).clamp(max=ALPHA_MAX)
     alpha = torch.where(alpha >= ALPHA_MIN, alpha, 0)

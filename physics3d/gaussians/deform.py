@@ -1,0 +1,145 @@
+"""Gaussians carried by particles: the nearest particles extrapolate each its own affine motion, and these are blended.
+
+    x_g = sum_j w_j (x_j + F_j (X_g - X_j)),   F_g = sum_j w_j F_j,   Sigma = F_g Sigma_0 F_g^T       [m], [1], [m^2]
+    w_j ~ exp(-|X_g - X_j|^2 / (2 spacing^2)),   sum_j w_j = 1
+
+F is the total deformation gradient, so plastic flow shows. An affine motion is carried exactly, a smooth one with an
+error of second order in the spacing. Spherical harmonics turn with the body: the viewing direction is taken back by
+R^T, F = R S.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from physics3d.artifact import AbstractArtifact, require_finite
+from physics3d.gaussians.cameras import Camera
+from physics3d.gaussians.model import Gaussians
+from physics3d.gaussians.rasterize import Rendered, rasterize
+from physics3d.gaussians.sh import sh_color
+
+NEIGHBOURS = 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class Embedding(AbstractArtifact):
+    """Which Gaussians move, and with which particles."""
+
+    which: Int[Tensor, " g"]  # index into Gaussians
+    neighbours: Int[Tensor, "g k"]  # index into the particles
+    weights: Float[Tensor, "g k"]  # positive, each row sums to 1
+
+    def check(self) -> None:
+        g = len(self.which)
+        if self.neighbours.shape != self.weights.shape or self.neighbours.ndim != 2 or len(self.neighbours) != g:
+            raise ValueError(
+                f"Embedding: neighbours {tuple(self.neighbours.shape)} and weights {tuple(self.weights.shape)} "
+                f"must both be ({g}, k); build it with embed()"
+            )
+        require_finite("Embedding.weights", self.weights)
+        if g and ((self.weights.sum(-1) - 1).abs().max() > 1e-5 or self.neighbours.min() < 0 or self.which.min() < 0):
+            raise ValueError("Embedding: weights must sum to 1 in every row and indices be >= 0; build it with embed()")
+
+
+def embed(
+    position_of_gaussians: Float[Tensor, "g 3"],
+    which: Int[Tensor, " g"],
+    particle_position: Float[Tensor, "p 3"],
+    spacing: float,
+) -> Embedding:
+    """Tie each Gaussian to its (at most 8) nearest particles in the rest state [m]; `spacing` of the particles [m].
+
+    Raises ValueError if there is no particle, or spacing is not positive.
+    """
+    from scipy.spatial import cKDTree
+
+    if len(particle_position) == 0:
+        raise ValueError("embed: no particles to carry the Gaussians; fill the body first")
+    if not spacing > 0:
+        raise ValueError(f"embed: spacing is {spacing} m; it must be positive")
+    if len(position_of_gaussians) != len(which):
+        raise ValueError(f"embed: {len(position_of_gaussians)} positions for {len(which)} indices; must be equal")
+    require_finite("embed: position_of_gaussians", position_of_gaussians)
+    require_finite("embed: particle_position", particle_position)
+    k = min(NEIGHBOURS, len(particle_position))
+    tree = cKDTree(particle_position.detach().cpu().double().numpy())
+    distance, neighbours = tree.query(position_of_gaussians.detach().cpu().double().numpy(), k=list(range(1, k + 1)))
+    weights = torch.softmax(-0.5 * (torch.from_numpy(distance) / spacing) ** 2, -1)
+    return Embedding(which=which.long().cpu(), neighbours=torch.from_numpy(neighbours).long(), weights=weights)
+
+
+def carry(
+    gaussians: Gaussians,
+    embedding: Embedding,
+    X: Float[Tensor, "p 3"],
+    x: Float[Tensor, "p 3"],
+    F: Float[Tensor, "p 3 3"],
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3 3"], Float[Tensor, "n 3 3"] | None]:
+    """Means [m], covariances [m^2] and rotations of all Gaussians when particles went from X to x [m] with total F.
+
+    Differentiable in x and F, in the precision of x. Gaussians that are not embedded stay as they are. Rotations are
+    None where nothing depends on the viewing direction.
+    """
+    which, near = embedding.which.to(x.device), embedding.neighbours.to(x.device)
+    w = embedding.weights.to(x)
+    mean, covariance = gaussians.mean.to(x), gaussians.covariance().to(x)
+    moved = torch.einsum(
+        "gk,gki->gi", w, x[near] + torch.einsum("gkij,gkj->gki", F[near], mean[which, None] - X.to(x)[near])
+    )
+    F_g = torch.einsum("gk,gkij->gij", w, F[near])
+    rotation = None
+    if gaussians.sh.shape[1] > 1:
+        rotation = torch.eye(3).to(x).expand(len(mean), 3, 3).index_copy(0, which, _Rotation.apply(F_g))
+    turned = F_g @ covariance[which] @ F_g.mT
+    return mean.index_copy(0, which, moved), covariance.index_copy(0, which, turned), rotation
+
+
+def render_deformed(
+    gaussians: Gaussians,
+    embedding: Embedding,
+    X: Float[Tensor, "p 3"],
+    x: Float[Tensor, "p 3"],
+    F: Float[Tensor, "p 3 3"],
+    camera: Camera,
+    *,
+    background: Float[Tensor, " 3"] | tuple[float, float, float],
+) -> Rendered:
+    """Draw the Gaussians where the particles have carried them; differentiable in x, F and the model's appearance."""
+    mean, covariance, rotation = carry(gaussians, embedding, X, x, F)
+    direction = mean - camera.centre.to(mean)
+    if rotation is not None:
+        direction = torch.einsum("nji,nj->ni", rotation, torch.nn.functional.normalize(direction, dim=-1))
+    color = sh_color(gaussians.sh, direction.to(gaussians.sh))
+    return rasterize(mean, covariance, gaussians.opacity, color, camera, background=background)
+
+
+class _Rotation(torch.autograd.Function):
+    """R of the polar decomposition F = R S, S = V diag(s) V^T, det R = 1.
+
+    dR = R [omega], (tr(S) I - S) omega = axial(R^T dF - dF^T R): the adjoint divides by s_j + s_k only, so that F = I,
+    where the derivative of an SVD is 0/0, is an ordinary point. s_j + s_k is held above 1e-6 (inverted, undecided).
+    """
+
+    @staticmethod
+    def forward(ctx, F):
+        U, s, Vt = torch.linalg.svd(F)
+        sign = torch.det(U @ Vt)
+        U = torch.cat([U[..., :2], U[..., 2:] * sign[:, None, None]], -1)
+        s = torch.cat([s[:, :2], s[:, 2:] * sign[:, None]], -1)
+        R = U @ Vt
+        ctx.save_for_backward(R, s, Vt)
+        return R
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, R_bar):
+        R, s, Vt = ctx.saved_tensors
+        M = R.mT @ R_bar
+        u = torch.stack([M[:, 2, 1] - M[:, 1, 2], M[:, 0, 2] - M[:, 2, 0], M[:, 1, 0] - M[:, 0, 1]], -1)
+        y = torch.einsum("nij,nj->ni", Vt, u) / (s.sum(-1, keepdim=True) - s).clamp_min(1e-6)
+        y = torch.einsum("nji,nj->ni", Vt, y)
+        zero = torch.zeros_like(y[:, 0])
+        cross = torch.stack([zero, -y[:, 2], y[:, 1], y[:, 2], zero, -y[:, 0], -y[:, 1], y[:, 0], zero], -1)
+        return R @ cross.reshape(-1, 3, 3)
