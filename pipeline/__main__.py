@@ -1,0 +1,137 @@
+"""Command line: python -m pipeline scene=carnation profile=smoke learn.steps=50
+
+Composes the configuration, says "up to date" if everything has been filed, else runs the flow under Prefect, records it in
+MLflow, and prints what came out. Nothing heavy is imported before it is needed. Exit codes: 0 done, 1 a stage failed,
+2 the command line is wrong, 130 Ctrl-C.
+"""
+
+import logging
+import os
+import sys
+import time
+import warnings
+from pathlib import Path
+from typing import Any
+
+from pipeline.flow import execute, up_to_date
+from pipeline.report import report
+from pipeline.settings import CONF, GROUPS, SettingsError, choices, compose, described
+from pipeline.stage import Filed, StageError
+
+USAGE = """\
+python -m pipeline [group=name ...] [key=value ...]      e.g. python -m pipeline scene=carnation profile=smoke
+
+Runs the pipeline on a scene; what has been computed before is reused. Keys are those of conf/config.yaml:
+    learn.steps=50              any number of any stage
+    data=<folder>               where data sets lie
+    output=<folder>             where artifacts/, mlflow.db and mlartifacts/ go
+    device=auto|cpu|cuda        seed=0
+    verify=true                 check stored results by content, not only by size
+    --help  --config            this text; the configuration as composed, without running
+"""
+
+
+def main(words: list[str]) -> int:
+    started = time.monotonic()
+    if "--help" in words or "-h" in words:
+        print(usage())
+        return 0
+    try:
+        config, picked = compose([w for w in words if w != "--config"])
+        if "--config" in words:
+            show(config)
+            return 0
+        return run(config, picked, started)
+    except SettingsError as error:
+        return _fail(str(error), 2)
+    except StageError as error:
+        return _fail(str(error), 1)
+    except KeyboardInterrupt:
+        print("\ninterrupted; finished stages are kept, the same command goes on from there", file=sys.stderr)
+        return 130
+    except Exception as error:
+        if os.environ.get("PHYSICS3D_TRACEBACK"):
+            raise
+        text = " ".join(str(error).split()) or type(error).__name__
+        return _fail(f"{text} (PHYSICS3D_TRACEBACK=1 shows where)", 1)
+
+
+def run(config: dict[str, Any], picked: dict[str, str], started: float) -> int:
+    output = Path(config["output"]).expanduser().resolve()
+    shelf = output / "artifacts"
+    verify = config["verify"]
+    plan = up_to_date(config, shelf, verify)
+    if plan is not None:
+        report(plan, {step.name: True for step in plan.steps})
+        print(f"up to date: all {len(plan.steps)} steps were computed before ({time.monotonic() - started:.1f} s)")
+        return 0
+
+    from pipeline.tracking import Tracking, address, git_commit
+
+    _quiet()
+    hits: dict[str, bool] = {}
+    tracking: Tracking | None = None
+    tags = {**picked, "git": git_commit(CONF.parent)}
+    name = " ".join(picked[g] for g in ("scene", "method", "profile"))
+    status, scores = "FAILED", {}
+
+    def done(filed: Filed) -> None:
+        nonlocal tracking
+        tracking = tracking or Tracking(output, config=config, name=name, tags=tags)
+        tracking.stage(filed)
+        hits[filed.step.name] = filed.hit
+
+    try:
+        plan, _ = execute(config, shelf, output / ".prefect", device(config["device"]), verify, done)
+        scores = report(plan, hits)
+        status = "FINISHED"
+    except KeyboardInterrupt:
+        status = "KILLED"
+        raise
+    finally:
+        if tracking is not None:
+            tracking.close(scores=scores, status=status)
+    if tracking is not None and not tracking.broken:
+        print(f"all runs  make ui, or {address(output)}")
+    print(f"done in {time.monotonic() - started:.0f} s")
+    return 0
+
+
+def device(asked: str) -> str:
+    """auto -> cuda if there is one, else cpu. Raises SettingsError if CUDA is asked for and absent."""
+    import torch
+
+    if asked not in ("auto", "cpu") and not (asked.startswith("cuda") and torch.cuda.is_available()):
+        raise SettingsError(f"device={asked}: not available here; use device=cpu or device=auto")
+    return ("cuda" if torch.cuda.is_available() else "cpu") if asked == "auto" else asked
+
+
+def usage() -> str:
+    lines = [USAGE]
+    for group in GROUPS:
+        lines.append(f"{group}=")
+        lines += [f"    {name:<24}{described(CONF / group / f'{name}.yaml')}" for name in choices(group)]
+    return "\n".join(lines)
+
+
+def show(config: dict[str, Any]) -> None:
+    from omegaconf import OmegaConf
+
+    print(OmegaConf.to_yaml(config))
+
+
+def _quiet() -> None:
+    """Libraries talk to themselves; the person watching reads our lines."""
+    warnings.filterwarnings("ignore", category=DeprecationWarning)
+    warnings.filterwarnings("ignore", category=FutureWarning)
+    for name in ("prefect", "httpx", "alembic", "mlflow"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+
+
+def _fail(text: str, code: int) -> int:
+    print(f"error: {text}", file=sys.stderr)
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,123 @@
+"""The pipeline as a graph: which stage takes what, and which stages a scene does not need.
+
+    capture -> reconstruct -> segment -> fill -> learn -> simulate -> render -> evaluate
+                                 guess (the configured material) -> learn's start, and what is compared with
+
+`plan` writes the graph down without running anything, so that "is everything up to date?" is answered in a second;
+`execute` runs it as a Prefect flow, one task per step.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pipeline.server import server
+from pipeline.stage import Filed, Part, Step, as_task, build, damage, peek
+
+STAGES = ("capture", "guess", "reconstruct", "segment", "fill", "learn", "simulate", "render", "evaluate")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Steps in an order in which they can run, and the stages that are left out, with the reason."""
+
+    steps: list[Step]
+    left_out: dict[str, str] = field(default_factory=dict)
+
+
+def first(config: dict[str, Any], shelf: Path) -> Step:
+    """The step that everything else depends on: what it finds decides which stages are needed."""
+    return Step.of("capture", "capture", config["capture"], (), shelf)
+
+
+def plan(config: dict[str, Any], capture: Step) -> Plan:
+    """The graph of a scene whose capture has been filed."""
+    without = left_out(config, peek(capture.folder))
+    steps = [capture]
+
+    def step(name: str, *inputs: Any, stage: str | None = None) -> Step:
+        stage = stage or name
+        steps.append(Step.of(name, stage, config[stage], inputs, capture.shelf))
+        return steps[-1]
+
+    guess = step("guess")
+    gaussians = capture.part("gaussians") if "reconstruct" in without else step("reconstruct", capture)
+    segmentation = None if "segment" in without else step("segment", capture, gaussians)
+    body = step("fill", gaussians, segmentation)
+    estimate = guess if "learn" in without else step("learn", capture, gaussians, body)
+    trajectory = step("simulate", body, estimate)
+    video = step("render", capture, gaussians, body, trajectory)
+    if "evaluate" not in without:
+        videos, estimates = {"learned": video}, {"learned": estimate}
+        if "learn" in without:
+            videos, estimates = {"initial": video}, {"initial": estimate}
+        else:
+            motion = step("simulate_initial", body, guess, stage="simulate")
+            videos["initial"] = step("render_initial", capture, gaussians, body, motion, stage="render")
+            estimates["initial"] = guess
+        step("evaluate", capture, videos, estimates)
+    return Plan(steps, without)
+
+
+def left_out(config: dict[str, Any], capture: dict[str, Any]) -> dict[str, str]:
+    """Stage -> why this scene, or this method, does without it. `capture` is the stored Capture, see `peek`."""
+    why = {name: f"the configuration says {name}=null" for name in STAGES if config.get(name) is None}
+    takes = {take["role"]: take for take in reversed(capture["takes"])}
+    if capture["gaussians"] is not None:
+        why["reconstruct"] = "the scene is a trained model already"
+    if capture["single_object"]:
+        why["segment"] = "the scene is a single object"
+    if "learn" not in takes:
+        why.setdefault("learn", "the scene has no recorded motion to learn from")
+    if "evaluate" not in takes and not takes.get("learn", {}).get("held_out_cameras"):
+        why["evaluate"] = "the scene has no recorded motion to compare with"
+    return why
+
+
+def up_to_date(config: dict[str, Any], shelf: Path, verify: bool) -> Plan | None:
+    """The plan, if every step of it has been filed already, else None."""
+    capture = first(config, shelf)
+    if damage(capture, verify):
+        return None
+    whole = plan(config, capture)
+    return None if any(damage(step, verify) for step in whole.steps) else whole
+
+
+def execute(
+    config: dict[str, Any], shelf: Path, home: Path, device: str, verify: bool, done: Callable[[Filed], None]
+) -> tuple[Plan, list[Filed]]:
+    """Run the graph under Prefect; `done` is called after each step. Raises StageError with one line."""
+
+    def check() -> None:
+        """Build every stage once, so that a bad value is found before hours of work, not after."""
+        for name in STAGES:
+            build(config.get(name), device, name)
+
+    with server(home, meanwhile=check):
+        from prefect import flow
+
+        @flow(name="physics3d", flow_run_name=config["scene"]["name"], persist_result=False)
+        def physics3d() -> tuple[Plan, list[Filed]]:
+            filed: dict[Step, Filed] = {}
+
+            def compute(step: Step) -> None:
+                filed[step] = as_task(step, device, verify)([filed[s] for s in _steps(step.inputs)])
+                done(filed[step])
+
+            capture = first(config, shelf)
+            compute(capture)
+            whole = plan(config, capture)
+            for name, why in whole.left_out.items():
+                print(f"{name:>16} | left out: {why}", flush=True)
+            for step in whole.steps[1:]:
+                compute(step)
+            return whole, list(filed.values())
+
+        return physics3d()
+
+
+def _steps(inputs: Any) -> list[Step]:
+    """The steps behind a step's inputs."""
+    sources = [s for i in inputs for s in (i.values() if isinstance(i, dict) else [i])]
+    return [s.step if isinstance(s, Part) else s for s in sources if s is not None]

@@ -1,0 +1,99 @@
+"""The Prefect server of one run. A flow needs one; it lives exactly as long as the process that started it.
+
+Prefect would start one by itself, but that one dies before the flow when Ctrl-C reaches the whole terminal, and outlives it
+after `kill -9`. Ours runs in a session of its own under a shell that waits for the end of a pipe we hold: however this
+process ends, the pipe closes and the shell stops the server. Set PREFECT_API_URL to use a server of your own.
+"""
+
+import fcntl
+import os
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+PATIENCE = 180  # a first start creates the database, on a busy machine [s]
+SETTINGS = {
+    "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
+    "PREFECT_TELEMETRY_ENABLE_RESOURCE_METRICS": "false",
+    "PREFECT_LOGGING_LEVEL": "CRITICAL",
+    "PREFECT_LOGGING_TO_API_ENABLED": "false",
+    "PREFECT_SERVER_UI_ENABLED": "false",
+    "DO_NOT_TRACK": "true",
+}
+
+
+@contextmanager
+def server(home: Path, meanwhile: Callable[[], None]) -> Iterator[None]:
+    """Start a server with its database under `home`, call `meanwhile` while it starts (12 s), stop it at the end.
+
+    Must be entered before Prefect is imported. Raises RuntimeError if the server does not come up.
+    """
+    os.environ.setdefault("PREFECT_HOME", str(home))
+    for name, value in SETTINGS.items():
+        os.environ.setdefault(name, value)
+    if "PREFECT_API_URL" in os.environ:
+        meanwhile()
+        yield
+        return
+    home = Path(os.environ["PREFECT_HOME"])
+    home.mkdir(parents=True, exist_ok=True)
+    with (home / "start.lock").open("w") as lock:  # two first starts at once would both migrate the database
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        process, address = _start(home / "server.log")
+        try:
+            meanwhile()
+            _await(process, f"{address}/health", home / "server.log")
+        except BaseException:
+            _stop(process)
+            raise
+    os.environ["PREFECT_API_URL"] = address
+    try:
+        yield
+    finally:
+        del os.environ["PREFECT_API_URL"]
+        _stop(process)
+
+
+def _start(log: Path) -> tuple[subprocess.Popen, str]:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    serve = [sys.executable, "-m", "uvicorn", "--factory", "prefect.server.api.server:create_app"]
+    options = ["--host", "127.0.0.1", "--port", str(port), "--log-level", "error", "--lifespan", "on"]
+    # "$@" is the server; cat returns when the other end of the pipe is closed
+    script = '"$@" </dev/null & server=$!; cat >/dev/null; kill $server; wait $server'
+    with log.open("w") as lines:
+        process = subprocess.Popen(
+            ["sh", "-c", script, "sh", *serve, *options],
+            stdin=subprocess.PIPE,
+            stdout=lines,
+            stderr=lines,
+            start_new_session=True,
+            env={**os.environ, "PREFECT__SERVER_EPHEMERAL": "1"},
+        )
+    return process, f"http://127.0.0.1:{port}/api"
+
+
+def _await(process: subprocess.Popen, url: str, log: Path) -> None:
+    deadline = time.monotonic() + PATIENCE
+    while time.monotonic() < deadline and process.poll() is None:
+        try:
+            with urllib.request.urlopen(url, timeout=5):
+                return
+        except OSError:
+            time.sleep(0.1)
+    raise RuntimeError(f"the Prefect server did not start; see {log}, or set PREFECT_API_URL to one of your own")
+
+
+def _stop(process: subprocess.Popen) -> None:
+    assert process.stdin is not None
+    process.stdin.close()
+    try:
+        process.wait(timeout=10)
+    except subprocess.TimeoutExpired:
+        process.kill()
