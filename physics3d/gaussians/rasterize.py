@@ -6,10 +6,10 @@
     give      color = sum w c + T_end background,   alpha = 1 - T_end,   depth = sum w z / sum w    [m]
 
 A thread owns a square of pixels and walks the depth-ordered list of its tile: Gaussians outside, pixels inside. On a
-CPU the square is the whole tile (a Warp kernel runs there on one thread, so each core gets a share of the tiles); on CUDA
-it is one pixel. Blending's adjoint is written by hand: it walks the same list front to back once more and needs only the
-remaining sum of what lies behind. The adjoint of the projection is Warp's. `twin.py` says the same in plain torch, and
-the tests compare.
+CPU the square is the whole tile (a Warp kernel runs there on one thread, so each core gets a share of the tiles); on
+CUDA it is one pixel. Blending's adjoint is written by hand: it walks the same list front to back once more and needs
+only the remaining sum of what lies behind. The adjoint of the projection is Warp's. `twin.py` says the same in plain
+torch, and the tests compare.
 """
 
 # ruff: noqa: UP018, RUF046 (in a Warp kernel a literal is a constant, float(0.0) is a variable)
