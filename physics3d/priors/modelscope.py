@@ -1,0 +1,94 @@
+"""ModelScope text to video (Wang et al. 2023): an epsilon network on the variance-preserving schedule, guided by a
+sentence.
+
+    z0 = VAE.encode(2 x - 1).mode() * scaling_factor                   code [t, 4, h/8, w/8]
+    alpha_t = sqrt(abar_t), sigma_t = sqrt(1 - abar_t)
+    out = uncond + guidance (cond - uncond),   x0_hat = (z_t - sigma_t out) / alpha_t
+
+diffusers keeps its pipeline under `pipelines.deprecated`; weights and networks are unchanged.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from physics3d.priors.base import AbstractPrior, Level, x0_from
+from physics3d.priors.weights import load_pipeline
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelScope(AbstractPrior):
+    prompt: str  # what is seen and how it moves, e.g. "a carnation sways gently after being poked"
+    model: str = "ali-vilab/text-to-video-ms-1.7b"  # folder or hub repository
+    variant: str | None = "fp16"  # which weight files; None for the plain ones
+    precision: str = "float16"  # float32 on a CPU
+    device: str = "cuda"
+    height: int = 256  # what the network sees [px]
+    width: int = 256
+    guidance: float = 9.0
+    time: tuple[float, float] = (0.02, 0.98)  # range of the schedule that is drawn from, uniformly
+
+    def __post_init__(self):
+        if not self.prompt.strip():
+            raise ValueError("prior.prompt is empty; say in a sentence what is seen and how it moves")
+        if self.height % 8 or self.width % 8:
+            raise ValueError(f"prior.height x prior.width is {self.height} x {self.width}; both must be multiples of 8")
+        if not 0 <= self.time[0] <= self.time[1] <= 1:
+            raise ValueError(f"prior.time is {self.time}; give 0 <= lowest <= highest <= 1")
+
+    @cached_property
+    def pipeline(self) -> Any:
+        from diffusers.pipelines.deprecated.text_to_video_synthesis import TextToVideoSDPipeline
+
+        dtype = getattr(torch, self.precision)
+        pipe = load_pipeline(TextToVideoSDPipeline, self.model, key="prior.model", dtype=dtype, variant=self.variant)
+        for module in (pipe.unet, pipe.vae, pipe.text_encoder):
+            module.requires_grad_(False).eval().to(self.device)
+        return pipe
+
+    @cached_property
+    def embedding(self) -> Float[Tensor, "2 l c"]:
+        """Of the empty sentence and of the prompt."""
+        with torch.no_grad():
+            given, without = self.pipeline.encode_prompt(self.prompt, self.device, 1, True, "")
+        return torch.cat([without, given])
+
+    def condition(self, first: Float[Tensor, "h w 3"], clips: tuple[Float[Tensor, "t h w 3"], ...]) -> Tensor:
+        """The embedded sentence; neither the image nor the clips are used."""
+        return self.embedding
+
+    def encode(self, video: Float[Tensor, "t h w 3"]) -> Float[Tensor, "t c H W"]:
+        if len(video) < 2:
+            raise ValueError("ModelScope needs at least 2 frames; raise learn.frames (it was trained on 16)")
+        vae, like = self.pipeline.vae, next(self.pipeline.unet.parameters())
+        frames = torch.nn.functional.interpolate(
+            video.permute(0, 3, 1, 2), (self.height, self.width), mode="bilinear", antialias=True, align_corners=False
+        )
+        # frame by frame, its activations recomputed in the backward pass: the encoder is what fills the memory
+        codes = [
+            checkpoint(lambda x: vae.encode(x).latent_dist.mode(), f[None], use_reentrant=False)
+            for f in 2 * frames.to(like) - 1
+        ]
+        return torch.cat(codes).float() * vae.config.scaling_factor
+
+    def level(self, generator: torch.Generator) -> Level:
+        schedule = self.pipeline.scheduler.alphas_cumprod
+        low, high = (round(t * (len(schedule) - 1)) for t in self.time)
+        index = int(torch.randint(low, high + 1, (), generator=generator))
+        return Level(alpha=math.sqrt(schedule[index]), sigma=math.sqrt(1 - schedule[index]), time=float(index))
+
+    def x0_hat(self, z_t: Tensor, level: Level, condition: Tensor) -> Tensor:
+        unet, like = self.pipeline.unet, next(self.pipeline.unet.parameters())
+        both = z_t.transpose(0, 1)[None].expand(2, -1, -1, -1, -1).to(like)  # the network wants [batch, c, t, h, w]
+        time = torch.tensor(level.time).to(like.device)
+        out = unet(both, time, encoder_hidden_states=condition.to(like), return_dict=False)[0].float()
+        without, given = out.transpose(1, 2)
+        return x0_from(
+            self.pipeline.scheduler.config.prediction_type, without + self.guidance * (given - without), z_t, level
+        )

@@ -1,0 +1,118 @@
+"""Stable Video Diffusion (Blattmann et al. 2023): image to video, a v_prediction network in Karras' sigma space
+(alpha = 1).
+
+    z0 = VAE.encode(2 x - 1).mode() * scaling_factor                               code [t, 4, h/8, w/8]
+    out = UNet(z_t / sqrt(s^2 + 1) beside the image's code, time ln(s)/4, CLIP embedding of the image,
+               [fps - 1, motion bucket, noise strength])
+    x0_hat = z_t / (s^2 + 1) - s out / sqrt(s^2 + 1)
+
+The image's code is not scaled and is that of image + noise_strength * n. The unconditional branch has zeros for the
+CLIP embedding and the image's code; guidance rises linearly over the frames. As in diffusers' pipeline, but as one
+call with a gradient through the encoder.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from physics3d.priors.base import AbstractPrior, Level, x0_from
+from physics3d.priors.weights import load_pipeline
+
+
+class ImageCondition(NamedTuple):
+    embedding: Tensor  # [1, 1, c] CLIP
+    latent: Tensor  # [4, h/8, w/8], unscaled
+
+
+@dataclass(frozen=True, kw_only=True)
+class StableVideo(AbstractPrior):
+    model: str = (
+        "stabilityai/stable-video-diffusion-img2vid"  # folder or hub repository; trained on 14 frames (-xt: 25)
+    )
+    variant: str | None = "fp16"  # which weight files; None for the plain ones
+    precision: str = "float16"  # float32 on a CPU
+    device: str = "cuda"
+    height: int = 576  # what the network sees [px]
+    width: int = 1024
+    fps: float = 7.0  # [1/s], told to the network
+    motion_bucket: int = 127  # 0..255, how much motion to expect
+    noise_strength: float = 0.02  # noise on the conditioning image
+    guidance: tuple[float, float] = (1.0, 3.0)  # first and last frame
+    sigma: tuple[float, float] = (0.3, 30.0)  # noise levels, drawn uniformly in the logarithm
+
+    def __post_init__(self):
+        if self.height % 8 or self.width % 8:
+            raise ValueError(f"prior.height x prior.width is {self.height} x {self.width}; both must be multiples of 8")
+        if not 0 < self.sigma[0] <= self.sigma[1]:
+            raise ValueError(f"prior.sigma is {self.sigma}; give 0 < lowest <= highest")
+
+    @cached_property
+    def pipeline(self) -> Any:
+        from diffusers import StableVideoDiffusionPipeline
+
+        dtype = getattr(torch, self.precision)
+        pipe = load_pipeline(
+            StableVideoDiffusionPipeline, self.model, key="prior.model", dtype=dtype, variant=self.variant
+        )
+        for module in (pipe.unet, pipe.vae, pipe.image_encoder):
+            module.requires_grad_(False).eval().to(self.device)
+        return pipe
+
+    @torch.no_grad()
+    def condition(self, first: Float[Tensor, "h w 3"], clips: tuple[Float[Tensor, "t h w 3"], ...]) -> ImageCondition:
+        """CLIP embedding and code of the first image; the recorded clips are not used."""
+        pipe, like = self.pipeline, next(self.pipeline.unet.parameters())
+        image = self.resize(first[None]).to(like)
+        size = pipe.feature_extractor.crop_size
+        small = torch.nn.functional.interpolate(
+            image.float(), (size["height"], size["width"]), mode="bicubic", antialias=True, align_corners=False
+        )
+        mean, std = (
+            torch.tensor(v).to(small)[:, None, None]
+            for v in (pipe.feature_extractor.image_mean, pipe.feature_extractor.image_std)
+        )
+        embedding = pipe.image_encoder(((small - mean) / std).to(like)).image_embeds[:, None]
+        noise = torch.randn(image.shape, generator=torch.Generator().manual_seed(0)).to(image)
+        latent = pipe.vae.encode(2 * image - 1 + self.noise_strength * noise).latent_dist.mode()[0]
+        return ImageCondition(embedding, latent)
+
+    def encode(self, video: Float[Tensor, "t h w 3"]) -> Float[Tensor, "t c H W"]:
+        if len(video) < 2:
+            raise ValueError(
+                "Stable Video Diffusion needs at least 2 frames; raise learn.frames (it was trained on 14 or 25)"
+            )
+        vae, like = self.pipeline.vae, next(self.pipeline.unet.parameters())
+        frames = 2 * self.resize(video).to(like) - 1
+        # frame by frame, its activations recomputed in the backward pass: the encoder is what fills the memory
+        codes = [checkpoint(lambda x: vae.encode(x).latent_dist.mode(), f[None], use_reentrant=False) for f in frames]
+        return torch.cat(codes).float() * vae.config.scaling_factor
+
+    def resize(self, video: Float[Tensor, "t h w 3"]) -> Float[Tensor, "t 3 H W"]:
+        return torch.nn.functional.interpolate(
+            video.permute(0, 3, 1, 2), (self.height, self.width), mode="bilinear", antialias=True, align_corners=False
+        )
+
+    def level(self, generator: torch.Generator) -> Level:
+        low, high = (math.log(s) for s in self.sigma)
+        sigma = math.exp(low + (high - low) * float(torch.rand((), generator=generator)))
+        return Level(alpha=1.0, sigma=sigma, time=math.log(sigma) / 4)
+
+    def x0_hat(self, z_t: Tensor, level: Level, condition: ImageCondition) -> Tensor:
+        pipe, like = self.pipeline, next(self.pipeline.unet.parameters())
+        sample = (z_t / math.hypot(1.0, level.sigma)).to(like)
+        latent = condition.latent.expand(len(z_t), -1, -1, -1)
+        both = torch.stack([torch.cat([sample, torch.zeros_like(latent)], 1), torch.cat([sample, latent], 1)])
+        embedding = torch.cat([torch.zeros_like(condition.embedding), condition.embedding])
+        ids = torch.tensor([[self.fps - 1, self.motion_bucket, self.noise_strength]] * 2).to(like)
+        time = torch.tensor(level.time).to(like)
+        without, given = pipe.unet(both, time, encoder_hidden_states=embedding, added_time_ids=ids, return_dict=False)[
+            0
+        ].float()
+        scale = torch.linspace(*self.guidance, len(z_t)).to(given)[:, None, None, None]
+        return x0_from(pipe.scheduler.config.prediction_type, without + scale * (given - without), z_t, level)
