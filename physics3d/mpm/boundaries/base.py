@@ -1,0 +1,116 @@
+"""What a boundary condition is to the solver: numbers, and up to three Warp functions, each at its place in a substep.
+
+    acceleration   added to selected particles before they are scattered           (forces from outside)
+    node           velocity of a grid node -> velocity of that node                 (walls, colliders, held regions)
+    steer          velocity and its gradient of selected particles after the gather  (motion imposed on the body itself)
+
+The solver calls whatever is there, in the order of the list, and never asks which one it has. A boundary's numbers are of two
+kinds: `parameters` are constant during a rollout, differentiable, and travel in one vector; `signals` depend on time and are
+computed on the host in float64 for every substep, so that a window in time is exact whatever the substep is.
+"""
+
+import abc
+import math
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+from jaxtyping import Float
+from torch import Tensor
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Setting:
+    """What a boundary may know of the body and the region, at rest."""
+
+    position: Float[Tensor, "p 3"]  # rest positions [m], float64
+    mass: Float[Tensor, " p"]  # [kg], float64
+    lower: Vector  # corner of the simulated region [m]
+    upper: Vector
+    dx: float  # [m]
+
+
+@dataclass(frozen=True, kw_only=True)
+class AbstractBoundary(abc.ABC):
+    """A boundary condition; its fields are SI numbers.
+
+    The Warp functions of a boundary (memoised by their arguments, so that equal boundaries share one) have the signatures
+        node(x: vec3, v: vec3, q: array[real], a: int, clock: array2d[real], row: int, b: int) -> vec3
+        acceleration(weight: real, x: vec3, q, a, clock, row, b) -> vec3
+        steer(weight: real, x: vec3, v: vec3, L: mat33, q, a, clock, row, b) -> (vec3, mat33)
+    where q[a + i] is its i-th parameter, clock[row, b + i] its i-th signal in this substep, clock[row, 0] is dt, x is in
+    metres, and weight what `selection` gave for the particle (never 0 in a call).
+    """
+
+    @abc.abstractmethod
+    def check(self) -> None:
+        """Raise ValueError naming the field, its value and the remedy."""
+
+    @abc.abstractmethod
+    def parameters(self, setting: Setting) -> Float[Tensor, " k"]:
+        """Constant numbers the Warp functions read, float64; differentiable where fields are tensors."""
+
+    def signals(self, t: float, dt: float) -> tuple[float, ...]:
+        """Numbers of the substep from t to t + dt [s]; always the same count."""
+        return ()
+
+    def selection(self, setting: Setting) -> Float[Tensor, " p"]:
+        """Weight per particle for `acceleration` and `steer`; 0 leaves the particle alone."""
+        return torch.zeros(len(setting.position), dtype=torch.float64)
+
+    def node(self, real: type) -> wp.Function | None:
+        return None
+
+    def acceleration(self, real: type) -> wp.Function | None:
+        return None
+
+    def steer(self, real: type) -> wp.Function | None:
+        return None
+
+
+def require(condition: bool, boundary: AbstractBoundary, field: str, remedy: str) -> None:
+    """Raise ValueError 'HalfSpace.normal is ...; take ...' unless the condition holds."""
+    if not condition:
+        raise ValueError(f"{type(boundary).__name__}.{field} is {getattr(boundary, field)}; take {remedy}")
+
+
+def require_finite(boundary: AbstractBoundary, *fields: str) -> None:
+    """Raise ValueError unless every field is a finite number or three of them."""
+    for field in fields:
+        value = torch.as_tensor(getattr(boundary, field), dtype=torch.float64).detach()
+        require(bool(torch.isfinite(value).all()), boundary, field, "finite numbers")
+        require(value.shape in ((), (3,)), boundary, field, "one number or three")
+
+
+def require_box(boundary: AbstractBoundary) -> None:
+    """Raise ValueError unless boundary.lower < boundary.upper along each axis."""
+    require_finite(boundary, "lower", "upper")
+    ordered = all(a < b for a, b in zip(boundary.lower, boundary.upper))  # type: ignore[attr-defined]
+    require(ordered, boundary, "lower", f"a corner below upper = {boundary.upper}")  # type: ignore[attr-defined]
+
+
+def require_window(boundary: AbstractBoundary) -> None:
+    """Raise ValueError unless the time window start, duration [s] has a length."""
+    require(math.isfinite(boundary.start), boundary, "start", "a finite time [s]")  # type: ignore[attr-defined]
+    require(boundary.duration > 0, boundary, "duration", "a time above 0 s")  # type: ignore[attr-defined]
+
+
+def overlap(start: float, duration: float, t: float, dt: float) -> float:
+    """Share of the substep [t, t + dt] inside the window [start, start + duration], 0..1."""
+    if dt <= 0:
+        return 0.0
+    return max(0.0, min(start + duration, t + dt) - max(start, t)) / dt
+
+
+def inside_box(position: Float[Tensor, "p 3"], lower: Vector, upper: Vector) -> Float[Tensor, " p"]:
+    """1 for particles in the closed box, else 0."""
+    low, high = position.new_tensor(lower), position.new_tensor(upper)
+    return ((position >= low) & (position <= high)).all(1).to(torch.float64)
+
+
+def require_selected(boundary: AbstractBoundary, selected: Float[Tensor, " p"]) -> None:
+    """Raise ValueError if the region of the boundary holds no particle."""
+    if not bool((selected != 0).any()):
+        raise ValueError(f"{boundary} holds none of the {len(selected)} particles at rest; move or enlarge its region")

@@ -1,0 +1,103 @@
+"""Half-space: a floor or a wall of any direction, sticky, slipping or separating, with Coulomb friction.
+
+For nodes behind the plane, n . (x - point) <= 0, with v_n = v . n and v_t = v - v_n n:
+    sticky     v = 0
+    slip       v = friction(v_t, |v_n|)
+    separate   the same where v_n < 0, else v unchanged
+    friction(v_t, j) = v_t max(0, 1 - mu j/|v_t|)
+Source: Stomakhin et al. (2013) A material point method for snow simulation, sec. 8.
+"""
+
+import functools
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+from jaxtyping import Float
+from torch import Tensor
+
+from physics3d.mpm.boundaries import base
+from physics3d.mpm.transfer import vector
+
+KINDS = ("sticky", "slip", "separate")
+
+
+@dataclass(frozen=True, kw_only=True)
+class HalfSpace(base.AbstractBoundary):
+    """Solid ground on the side the normal points away from."""
+
+    point: base.Vector  # of the plane [m]
+    normal: base.Vector  # out of the ground, any length
+    kind: str = "sticky"
+    friction: float = 0.0  # Coulomb coefficient, for slip and separate
+
+    def check(self) -> None:
+        base.require(self.kind in KINDS, self, "kind", f"one of {KINDS}")
+        base.require_finite(self, "point", "normal", "friction")
+        base.require(sum(n * n for n in self.normal) > 0, self, "normal", "a vector that is not zero")
+        base.require(self.friction >= 0, self, "friction", "a coefficient >= 0")
+
+    def parameters(self, setting: base.Setting) -> Float[Tensor, "8"]:
+        normal = torch.tensor(self.normal, dtype=torch.float64)
+        # a node on the plane belongs to the ground whatever the rounding
+        rest = [self.friction, 1e-3 * setting.dx]
+        return torch.cat(
+            [
+                torch.tensor(self.point, dtype=torch.float64),
+                normal / normal.norm(),
+                torch.tensor(rest, dtype=torch.float64),
+            ]
+        )
+
+    def node(self, real: type) -> wp.Function:
+        return _node(real, self.kind)
+
+
+@functools.cache
+def coulomb(real: type) -> wp.Function:
+    """Warp function (v_t, j, mu) -> v_t max(0, 1 - mu j/|v_t|), with a finite adjoint at v_t = 0."""
+    vec3 = vector(real)
+
+    @wp.func(name=f"coulomb_{real.__name__}")
+    def friction(vt: vec3, j: real, mu: real):
+        result = vt
+        if mu > real(0.0):
+            result = vec3()
+            square = wp.dot(vt, vt)
+            if square > mu * mu * j * j:
+                result = (real(1.0) - mu * j / wp.sqrt(square)) * vt
+        return result
+
+    return friction
+
+
+@functools.cache
+def _node(real: type, kind: str) -> wp.Function:
+    vec3 = vector(real)
+    friction = coulomb(real)
+    sticky, separate = kind == "sticky", kind == "separate"
+
+    @wp.func(name=f"half_space_{kind}_{real.__name__}")
+    def node(
+        x: vec3,
+        v: vec3,
+        q: wp.array(dtype=real),
+        a: int,
+        clock: wp.array2d(dtype=real),
+        row: int,
+        b: int,
+    ):
+        n = vec3(q[a + 3], q[a + 4], q[a + 5])
+        result = v
+        if wp.dot(n, x - vec3(q[a], q[a + 1], q[a + 2])) <= q[a + 7]:
+            vn = wp.dot(n, v)
+            if wp.static(sticky):
+                result = vec3()
+            elif wp.static(separate):
+                if vn < real(0.0):
+                    result = friction(v - vn * n, -vn, q[a + 6])
+            else:
+                result = friction(v - vn * n, wp.abs(vn), q[a + 6])
+        return result
+
+    return node
