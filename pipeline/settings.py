@@ -67,11 +67,19 @@ def _check_value(word: str, known: dict[str, Any]) -> None:
     node: Any = known
     done: list[str] = []
     for part in re.split(r"\.", key):
-        names = list(node) if isinstance(node, dict) else [str(i) for i in range(len(node))] if isinstance(node, list) else []
+        names = (
+            list(node)
+            if isinstance(node, dict)
+            else [str(i) for i in range(len(node))]
+            if isinstance(node, list)
+            else []
+        )
         if part not in names:
             where = f" in {'.'.join(done)}" if done else ""
             close = difflib.get_close_matches(part, names, 1)
-            hint = f"did you mean {'.'.join([*done, close[0]])}?" if close else f"there are {', '.join(names) or 'none'}"
+            hint = (
+                f"did you mean {'.'.join([*done, close[0]])}?" if close else f"there are {', '.join(names) or 'none'}"
+            )
             raise SettingsError(f"no {part!r}{where}; {hint}")
         node = node[part] if isinstance(node, dict) else node[int(part)]
         done.append(part)

@@ -6,7 +6,10 @@ from pathlib import Path
 
 import torch
 
+from physics3d.gaussians.cameras import Camera
+from physics3d.gaussians.model import Gaussians
 from physics3d.log import Log
+from physics3d.scenes.base import Capture, Take
 from physics3d.video import Video
 
 
@@ -27,7 +30,7 @@ class Add:
     device: str = "cpu"
     table: dict[str, float] = field(default_factory=dict)
 
-    def __call__(self, *inputs: Video, log: Log) -> Video:
+    def __call__(self, *inputs: object, log: Log) -> Video:
         with Path(self.diary).open("a") as lines:
             lines.write(self.name + "\n")
         log.info(f"adding {self.amount}")
@@ -39,4 +42,39 @@ class Add:
         time.sleep(self.seconds)
         if self.error:
             raise ValueError(self.error)
-        return clip(self.amount + sum(int(v.frames[0][0, 0, 0, 0]) for v in inputs))
+        videos = [v for v in inputs if isinstance(v, Video)]
+        return clip(self.amount + sum(int(v.frames[0][0, 0, 0, 0]) for v in videos))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Photograph:
+    """A capture of one grey photograph, with takes of the given roles."""
+
+    roles: tuple[str, ...] = ()
+    single_object: bool = False
+    trained: bool = False
+
+    def __call__(self, *, log: Log) -> Capture:
+        camera = Camera(width=8, height=8, fx=8.0, fy=8.0, cx=4.0, cy=4.0, world_to_camera=torch.eye(4).double())
+        return Capture(
+            name="toy",
+            images=(torch.full((8, 8, 3), 128, dtype=torch.uint8),),
+            cameras=(camera,),
+            names=("grey",),
+            takes=tuple(
+                Take(name=role, role=role, fps=1.0, cameras=(camera,), videos=clip(0).frames) for role in self.roles
+            ),
+            gaussians=blob() if self.trained else None,
+            single_object=self.single_object,
+            truth={"youngs_modulus": 2.0},
+        )
+
+
+def blob() -> Gaussians:
+    return Gaussians(
+        mean=torch.zeros(1, 3),
+        log_scale=torch.zeros(1, 3),
+        quaternion=torch.ones(1, 4),
+        opacity_logit=torch.zeros(1),
+        sh=torch.zeros(1, 1, 3),
+    )

@@ -1,0 +1,69 @@
+"""The import arrows of the architecture, read from the source with `ast`: who may know whom."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+SOURCES = sorted(p for folder in ("physics3d", "stages", "pipeline") for p in (ROOT / folder).rglob("*.py"))
+BOTTOM = ("physics3d.artifact", "physics3d.video", "physics3d.log")
+CORES = ("physics3d.gaussians", "physics3d.mpm", "physics3d.priors")
+ORCHESTRATION = ("prefect", "mlflow", "hydra", "omegaconf")
+# sam2 brings its own Hydra configuration files, which are read where its model is built
+EXCEPTIONS = {("physics3d.segmentation", "hydra"), ("physics3d.segmentation", "omegaconf")}
+HEAVY = ("diffusers", "transformers", "sam2", "open3d", "torchmetrics", "cv2", "matplotlib", "mlflow", "prefect")
+
+
+def module(path: Path) -> str:
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+
+
+def imports(tree: ast.AST) -> set[str]:
+    """Dotted names imported anywhere below `tree`."""
+    names = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "relative imports hide the arrows"
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return names
+
+
+def below(name: str, packages: tuple[str, ...]) -> str | None:
+    return next((p for p in packages if name == p or name.startswith(f"{p}.")), None)
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=module)
+def test_arrows_point_downwards(path: Path):
+    me, names = module(path), imports(ast.parse(path.read_text()))
+    for name in names:
+        if below(me, ("physics3d",)):
+            assert not below(name, ("stages", "pipeline")), f"{me} imports {name}: the library knows no stages"
+        if below(me, ("stages",)):
+            assert not below(name, ("pipeline",)), f"{me} imports {name}: a stage does not know who runs it"
+        if below(me, BOTTOM) and below(name, ("physics3d",)):
+            assert below(name, BOTTOM), f"{me} imports {name}: the bottom layer imports nothing from the project"
+        mine, other = below(me, CORES), below(name, CORES)
+        assert not (mine and other and mine != other), f"{me} imports {name}: gaussians, mpm, priors stay apart"
+        if mine:
+            allowed = below(name, (mine, *BOTTOM)) or not below(name, ("physics3d",))
+            assert allowed, f"{me} imports {name}: it stands below that"
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=module)
+def test_orchestration_lives_in_the_pipeline(path: Path):
+    me = module(path)
+    for name in imports(ast.parse(path.read_text())):
+        used = below(name, ORCHESTRATION)
+        excused = any(below(me, (package,)) and used == library for package, library in EXCEPTIONS)
+        assert not used or excused or below(me, ("pipeline",)), f"{me} imports {name}; only pipeline/ may"
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=module)
+def test_importing_costs_little(path: Path):
+    """Heavy libraries are imported inside the functions that need them."""
+    top = [node for node in ast.parse(path.read_text()).body if isinstance(node, ast.Import | ast.ImportFrom)]
+    found = {name for node in top for name in imports(node) if below(name, HEAVY)}
+    assert not found, f"{module(path)} imports {sorted(found)} at its top; move it into the function that needs it"
