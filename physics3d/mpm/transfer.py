@@ -116,15 +116,24 @@ def scatter(real) -> wp.Kernel:
             A = (m * dx) * L[p] - (real(4.0) * dt * volume[p] / dx) * tau[p]
             q = m * v[p] - A * f
             first_node = (int(ix) * ny + int(iy)) * nz + int(iz)
+            ax, ay, az = (
+                vec3(A[0, 0], A[1, 0], A[2, 0]),
+                vec3(A[0, 1], A[1, 1], A[2, 1]),
+                vec3(A[0, 2], A[1, 2], A[2, 2]),
+            )
+            qi = q  # the affine momentum at the node, built up by its increments from node to node
             for i in range(3):
+                qij = qi
                 for j in range(3):
                     wij = w[0, i] * w[1, j]
-                    qij = q + A * vec3(real(i), real(j), zero)
+                    qijk = qij
                     for k in range(3):
-                        wijk = wij * w[2, k]
-                        qijk = qij + A * vec3(zero, zero, real(k))
-                        value = vec4(wijk * qijk[0], wijk * qijk[1], wijk * qijk[2], wijk * m)
+                        weight = wij * w[2, k]
+                        value = vec4(weight * qijk[0], weight * qijk[1], weight * qijk[2], weight * m)
                         wp.atomic_add(grid, first_node + (i * ny + j) * nz + k, value)
+                        qijk = qijk + az
+                    qij = qij + ay
+                qi = qi + ax
         else:
             wp.atomic_add(lost, 0, 1)
 
@@ -163,18 +172,25 @@ def gather(real) -> wp.Kernel:
             w = weights(f)
             first_node = (int(ix) * ny + int(iy)) * nz + int(iz)
             mean, bx, by, bz = vec3(), vec3(), vec3(), vec3()
+            one = real(1.0)
+            rx = -f[0]
             for i in range(3):
+                ry = -f[1]
                 for j in range(3):
                     s, sz = vec3(), vec3()  # sums along a column of nodes
+                    rz = -f[2]
                     for k in range(3):
                         a = w[2, k] * node_velocity[first_node + (i * ny + j) * nz + k]
                         s = s + a
-                        sz = sz + (real(k) - f[2]) * a
-                    s = (w[0, i] * w[1, j]) * s
-                    mean = mean + s
-                    bx = bx + (real(i) - f[0]) * s
-                    by = by + (real(j) - f[1]) * s
-                    bz = bz + (w[0, i] * w[1, j]) * sz
+                        sz = sz + rz * a
+                        rz = rz + one
+                    wij = w[0, i] * w[1, j]
+                    mean = mean + wij * s
+                    bx = bx + (wij * rx) * s
+                    by = by + (wij * ry) * s
+                    bz = bz + wij * sz
+                    ry = ry + one
+                rx = rx + one
             v[p] = mean
             L[p] = (real(4.0) / dx) * wp.matrix_from_cols(bx, by, bz)
 
@@ -187,29 +203,31 @@ def clear(dtype) -> wp.Kernel:
 
     @wp.kernel(module="unique", enable_backward=False)
     def clear_kernel(
+        # in
+        first: int,
         # out
         values: wp.array(dtype=dtype),
     ):
-        values[wp.tid()] = dtype()
+        values[wp.tid() + first] = dtype()
 
     return clear_kernel
 
 
 @cache
 def total(dtype) -> wp.Kernel:
-    """Kernel: sum over the rows of private [threads, node] into the first row, in a fixed order."""
+    """Kernel: sum over the rows of grids [threads, node] into the first row, in a fixed order."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def total_kernel(
         # in
         first: int,  # node of thread 0
         # in, out
-        private: wp.array2d(dtype=dtype),  # [threads, node]
+        grids: wp.array2d(dtype=dtype),  # [threads, node]
     ):
         i = wp.tid() + first
-        s = private[0, i]
-        for t in range(1, private.shape[0]):
-            s = s + private[t, i]
-        private[0, i] = s
+        s = grids[0, i]
+        for t in range(1, grids.shape[0]):
+            s = s + grids[t, i]
+        grids[0, i] = s
 
     return total_kernel

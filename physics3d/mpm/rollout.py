@@ -1,0 +1,505 @@
+"""A whole trajectory as one differentiable function: the only place where torch meets the MPM solver.
+
+    rollout(world, parameters, position, volume, ...) -> Trajectory
+
+Time step. Waves cross a cell in dx/(c + |v|), with rho c^2 the wave modulus of the material times the current stretch
+squared; a lone particle, whose stress comes back undiluted, needs dt < dx/(sqrt(3) c) (its three axes act together; Sun,
+Shinar and Schroeder 2020). An automatic substep is cfl times the former and at most 0.95 times the latter. Every frame has
+a whole number of equal substeps; a frame that turns out too fast for its substeps is done again with more.
+
+Gradients. The exact adjoint of the discrete trajectory: the state is kept at every RUN-th substep, and the reverse pass
+recomputes the substeps in between, run by run, with the same dt and the same windows.
+"""
+
+import math
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from physics3d.artifact import AbstractArtifact, require_finite
+from physics3d.log import Log
+from physics3d.mpm.boundaries.base import AbstractBoundary, Setting, Vector
+from physics3d.mpm.substep import Hook, Substeps
+from physics3d.mpm.world import World
+
+RUN = 32  # substeps between two looks at the particles, and between two checkpoints
+MOST_NODES = 2**27
+TRIES = 6  # of one frame, each with twice the substeps
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trajectory(AbstractArtifact):
+    """Where the particles were, frame by frame; frame 0 is the initial state."""
+
+    rest_position: Float[Tensor, "p 3"]  # [m]
+    position: Float[Tensor, "t p 3"]  # [m]
+    deformation: Float[Tensor, "t p 3 3"]  # total F
+    fps: float
+    health: dict[str, list[float]]  # per frame, see `_health`
+    substeps: int  # of the frame that had most
+    substep_dt: float  # the shortest [s]
+
+    def check(self) -> None:
+        t, p = self.position.shape[:2]
+        if self.rest_position.shape != (p, 3) or self.deformation.shape != (t, p, 3, 3):
+            raise ValueError(
+                f"trajectory: rest_position {tuple(self.rest_position.shape)}, position {tuple(self.position.shape)} and "
+                f"deformation {tuple(self.deformation.shape)} disagree; expected [p, 3], [t, p, 3], [t, p, 3, 3]"
+            )
+        require_finite("trajectory.position", self.position)
+        require_finite("trajectory.deformation", self.deformation)
+
+
+def rollout(
+    world: World,
+    parameters: dict[str, Tensor],
+    position: Float[Tensor, "p 3"],
+    volume: Float[Tensor, " p"],
+    *,
+    velocity: Float[Tensor, "p 3"] | Float[Tensor, "3"] | None = None,
+    excitation: tuple[AbstractBoundary, ...] = (),
+    frames: int,
+    frame_dt: float,
+    device: str = "cpu",
+    threads: int | None = None,
+    log: Log,
+) -> Trajectory:
+    """Simulate `frames` frames, frame 0 being the initial state, frame_dt [s] apart.
+
+    `position` [m] at rest, `volume` [m^3] at rest, `velocity` [m/s] at the start (None: at rest), `parameters` SI, each a
+    scalar or one number per particle. The trajectory is differentiable with respect to parameters, velocity, position and the
+    forces of boundaries where these are tensors that require it. `threads` (CPU): None takes both cores where there are enough
+    particles. Raises ValueError naming the field, the value and the remedy."""
+    world.check()
+    boundaries = (*world.boundaries, *excitation)
+    _check_inputs(position, volume, velocity, boundaries, frames, frame_dt)
+    n, dtype = len(position), world.dtype
+    if velocity is None:
+        velocity = torch.zeros(3)
+    lower, upper = _region(world, position, velocity, frame_dt * (frames - 1))
+    mass = world.density * volume.detach().double().cpu()
+    setting = Setting(position=position.detach().double().cpu(), mass=mass, lower=lower, upper=upper, dx=world.dx)
+
+    # neighbours in space are neighbours in memory
+    order = _sorted_by_cell(setting.position, world.dx).to(device)
+    back = torch.argsort(order)
+
+    def place(value: Tensor) -> Tensor:
+        return value.to(device=device, dtype=dtype)
+
+    coefficients = world.material.coefficients({name: value.double().to(device) for name, value in parameters.items()})
+    coefficients = place(coefficients.expand(len(coefficients), n)[:, order])
+    q = [boundary.parameters(setting).to(torch.float64) for boundary in boundaries]
+    solver = _Solver(
+        world=world,
+        setting=setting,
+        boundaries=boundaries,
+        widths=tuple(len(k) for k in q),
+        order=order,
+        frames=frames,
+        frame_dt=frame_dt,
+        device=device,
+        threads=threads,
+        log=log,
+    )
+    u, deformation = _Rollout.apply(
+        coefficients,
+        place(torch.cat(q)) if q else torch.zeros(0, dtype=dtype, device=device),
+        place(velocity.to(device).expand(n, 3)[order]),
+        position.to(device=device, dtype=torch.float64)[order],
+        solver,
+    )
+    rest = position.to(device=device, dtype=torch.float64)
+    return Trajectory(
+        rest_position=place(rest),
+        position=place(rest + u[:, back].double()),
+        deformation=deformation[:, back],
+        fps=1.0 / frame_dt,
+        health=solver.health,
+        substeps=max(solver.counts, default=0),
+        substep_dt=min((frame_dt / count for count in solver.counts), default=frame_dt),
+    )
+
+
+@dataclass
+class _Run:
+    """Some substeps in a row under one window, as they were done; what the reverse pass replays."""
+
+    lowest: tuple[int, ...]
+    size: tuple[int, ...]
+    clock: np.ndarray  # [substeps, k]
+    flat: Tensor | None  # the state before, if gradients are wanted
+
+
+class _TooFast(Exception):
+    """This frame needs shorter substeps, or a wider window; the message says why."""
+
+
+@dataclass
+class _Solver:
+    """The forward loop over frames and the reverse loop over runs; `_Rollout` is its face to torch."""
+
+    world: World
+    setting: Setting
+    boundaries: tuple[AbstractBoundary, ...]
+    widths: tuple[int, ...]  # parameters of each boundary
+    order: Tensor
+    frames: int
+    frame_dt: float
+    device: str
+    threads: int | None
+    log: Log
+    counts: list[int] = field(default_factory=list)  # substeps of each frame
+    health: dict[str, list[float]] = field(default_factory=dict)
+
+    def forward(self, coefficients: Tensor, q: Tensor, velocity: Tensor, position: Tensor, keep: bool):
+        """Displacements [t, p, 3] and total deformations [t, p, 3, 3]."""
+        substeps = self._build(coefficients, q, position)
+        self.substeps, self.coefficients = substeps, coefficients
+        self.modulus = self.world.material.wave_modulus(coefficients)
+        first, now = substeps.state(0), substeps.state(1)
+        first.memory.copy_(self.world.material.initial_memory(len(position), self.world.dtype))
+        first.v_gathered.copy_(velocity)
+        self.initial = first.flat.clone()
+        substeps.start(self._clock(0.0, 0.0, 1), 0, 1)
+        self.runs: list[list[_Run]] = []
+        self.current = 1
+        n, kind = len(position), {"dtype": self.world.dtype, "device": self.device}
+        u, deformation = torch.empty((self.frames, n, 3), **kind), torch.empty((self.frames, n, 3, 3), **kind)
+        eye = torch.eye(3, **kind)
+        for frame in self.log.progress(range(self.frames), "simulate"):
+            if frame:
+                self._frame(frame, keep)
+            now = substeps.state(self.current)
+            u[frame], deformation[frame] = now.u, now.G + eye
+            for name, value in self._health(now).items():
+                self.health.setdefault(name, []).append(value)
+        return u, deformation
+
+    def backward(self, adjoint_u: Tensor, adjoint_F: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Gradients of coefficients, q, velocity and position."""
+        substeps = self.substeps
+        substeps.begin_adjoint()
+        side = 0
+        states = substeps.adjoint["states"]
+        for frame in range(self.frames - 1, 0, -1):
+            states[side].u.add_(adjoint_u[frame])
+            states[side].G.add_(adjoint_F[frame])
+            for run in reversed(self.runs[frame - 1]):
+                substeps.state(0).flat.copy_(run.flat)
+                substeps.set_window(run.lowest, run.size)
+                path = range(len(run.clock) + 1)
+                substeps.run(run.clock, path)
+                side = substeps.reverse(run.clock, path, side)
+        states[side].u.add_(adjoint_u[0])
+        states[side].G.add_(adjoint_F[0])
+        substeps.state(0).flat.copy_(self.initial)
+        substeps.start(self._clock(0.0, 0.0, 1), 0, 1)
+        side = substeps.reverse_start(self._clock(0.0, 0.0, 1), 0, 1, side)
+        return substeps.gradients(states[side].v_gathered)
+
+    def _frame(self, frame: int, keep: bool) -> None:
+        """From one frame to the next, in equal substeps that obey the limit; more of them if it turns out too fast."""
+        start = self.substeps.state(self.current).flat.clone()
+        count, reach = self._count(frame), 2.0
+        for _ in range(TRIES):
+            try:
+                self.runs.append(self._runs(frame, count, reach, keep))
+                self.counts.append(count)
+                return
+            except _TooFast as reason:
+                why = str(reason)
+                self.substeps.state(self.current).flat.copy_(start)
+                reach *= 4.0
+                if self.world.dt is None:
+                    count *= 2
+        dt = self.frame_dt / count
+        remedy = "a smaller cfl, a softer material or a weaker force" if self.world.dt is None else f"dt < {dt / 2:g}"
+        raise ValueError(f"frame {frame}: {why} with substeps of {dt:g} s; take {remedy}")
+
+    def _runs(self, frame: int, count: int, reach: float, keep: bool) -> list[_Run]:
+        dt = self.frame_dt / count
+        runs = []
+        for done in range(0, count, RUN):
+            steps = min(RUN, count - done)
+            now = self.substeps.state(self.current)
+            lowest, size = self._window(now, steps * dt, reach, frame)
+            self.substeps.set_window(lowest, size)
+            clock = self._clock((frame - 1) * self.frame_dt + done * dt, dt, steps)
+            runs.append(_Run(lowest, size, clock, now.flat.clone() if keep else None))
+            path = [(self.current + s) % 2 for s in range(steps + 1)]
+            lost = self.substeps.run(clock, path)
+            self.current = path[-1]
+            self._inspect(frame, dt, lost)
+        return runs
+
+    def _inspect(self, frame: int, dt: float, lost: int) -> None:
+        """After a run: is every number finite, every particle in the region, and every substep short enough?"""
+        now = self.substeps.state(self.current)
+        bad = int((~torch.isfinite(now.flat[: 3 * len(now.u)].view(-1, 3) + now.tau.sum((1, 2))[:, None])).any(1).sum())
+        if bad:
+            raise _TooFast(f"{bad} of {len(now.u)} particles have become infinite or NaN")
+        if lost:
+            raise _TooFast(f"particles moved too far in a few substeps ({lost} times outside the grid)")
+        limit = self._limit(now)
+        if dt > limit:
+            raise _TooFast(f"waves and particles cross a cell in {limit:g} s")
+        x = self.rest + now.u
+        slack = 1.5 * self.world.dx
+        low, high = x.new_tensor(self.setting.lower) - slack, x.new_tensor(self.setting.upper) + slack
+        outside = int(((x < low) | (x > high)).any(1).sum())
+        if outside:
+            raise ValueError(
+                f"frame {frame}: {outside} of {len(x)} particles left the simulated region {_corners(self.setting)}; "
+                "enlarge world.lower and world.upper, or add a BoundingBox or a HalfSpace"
+            )
+
+    def _window(self, now, duration: float, reach: float, frame: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """Nodes around the particles, with room for `reach` times the way they can go in `duration` [s]."""
+        speed = float(now.v.norm(dim=1).max()) + math.hypot(*self.world.gravity) * duration
+        cells = self.cell + (self.offset + now.u / self.world.dx).floor()
+        room = 2 + math.ceil(reach * (1 + speed * duration / self.world.dx))
+        lowest = cells.amin(0) - room
+        size = cells.amax(0) + room + 1 - lowest
+        if not bool(torch.isfinite(size).all()) or float(size.double().prod()) > MOST_NODES:
+            across = " x ".join(f"{s:g}" for s in size.tolist())
+            raise ValueError(
+                f"frame {frame}: the particles spread over {across} cells; take a larger dx or a BoundingBox"
+            )
+        return tuple(int(i) for i in lowest), tuple(int(i) for i in size)
+
+    def _clock(self, t: float, dt: float, steps: int) -> np.ndarray:
+        """Table for the kernels: dt, exp(-damping dt), signals of all boundaries."""
+        rows = []
+        for s in range(steps):
+            signals = [x for boundary in self.boundaries for x in boundary.signals(t + s * dt, dt)]
+            rows.append([dt, math.exp(-self.world.damping * dt), *signals])
+        return np.array(rows)
+
+    def _stretch(self, now) -> tuple[Tensor, Tensor]:
+        """(largest principal stretch, J) of the elastic deformation of every particle."""
+        F = now.H.double() + torch.eye(3, dtype=torch.float64, device=now.H.device)
+        C = F.mT @ F
+        mean = C.diagonal(dim1=1, dim2=2).mean(1)
+        B = C - mean[:, None, None] * torch.eye(3, dtype=C.dtype, device=C.device)
+        p = (B.square().sum((1, 2)) / 6).sqrt().clamp(min=1e-100)
+        r = (torch.linalg.det(B) / (2 * p**3)).clamp(-1, 1)
+        return (mean + 2 * p * torch.cos(torch.acos(r) / 3)).clamp(min=0).sqrt(), torch.linalg.det(F)
+
+    def _speeds(self, now) -> tuple[float, float]:
+        """(fastest wave, fastest particle) [m/s]. Stretched by s, waves are s times faster; strong compression stiffens."""
+        stretch, J = self._stretch(now)
+        stiffening = stretch.clamp(min=1) * (1 - J.clamp(1e-4, 1).log()).sqrt()
+        c = ((self.modulus.double() / self.world.density).sqrt() * stiffening).max()
+        return float(c), float(now.v.double().norm(dim=1).max())
+
+    def _limit(self, now) -> float:
+        """The longest stable substep [s]."""
+        c, v = self._speeds(now)
+        return min(self.world.dx / (c + v), self.world.dx / (math.sqrt(3) * c))
+
+    def _count(self, frame: int) -> int:
+        """Equal substeps of the coming frame. Raises ValueError where the user's dt is above the limit."""
+        now = self.substeps.state(self.current)
+        c, v = self._speeds(now)
+        dx, dt = self.world.dx, self.world.dt
+        if dt is not None:
+            limit = self._limit(now)
+            if dt > limit:
+                raise ValueError(
+                    f"substep_dt is {dt:g} s, waves cross a cell in {dx / (c + v):g} s (frame {frame}); "
+                    f"take world.dt < {limit:.3g}, or None for an automatic one"
+                )
+            return math.ceil(self.frame_dt / dt * (1 - 1e-9))
+        need = math.ceil(self.frame_dt / min(self.world.cfl * dx / (c + v), 0.95 * dx / (math.sqrt(3) * c)))
+        last = self.counts[-1] if self.counts else need
+        # a count that still serves is kept, so that dt does not flicker from frame to frame
+        return last if need <= last <= 1.5 * need else need
+
+    def _health(self, now) -> dict[str, float]:
+        """Numbers of one frame for a person to look at; SI. energy counts kinetic, elastic and potential energy."""
+        stretch, J = self._stretch(now)
+        mass, v = self.mass.double(), now.v.double()
+        x = self.rest.double() + now.u.double()
+        momentum = (mass[:, None] * v).sum(0)
+        kinetic = 0.5 * float((mass * v.square().sum(1)).sum())
+        psi = self.world.material.energy(self.coefficients, now.H, now.memory).double()
+        elastic = float((psi * self.volume.double()).sum())
+        potential = -float((mass * (x @ x.new_tensor(self.world.gravity))).sum())
+        speed = float(v.norm(dim=1).max())
+        dt = self.frame_dt / self.counts[-1] if self.counts else 0.0
+        return {
+            "speed_max": speed,
+            "cfl": dt * sum(self._speeds(now)) / self.world.dx,
+            "J_min": float(J.min()),
+            "J_max": float(J.max()),
+            "stretch_max": float(stretch.max()),
+            "inverted": float((J <= 0).sum()),
+            "isolated": float(_isolated(x, self.world.dx)),
+            "kinetic_energy": kinetic,
+            "elastic_energy": elastic,
+            "potential_energy": potential,
+            "energy": kinetic + elastic + potential,
+            "momentum_x": float(momentum[0]),
+            "momentum_y": float(momentum[1]),
+            "momentum_z": float(momentum[2]),
+            "substeps": float(self.counts[-1] if self.counts else 0),
+        }
+
+    def _build(self, coefficients: Tensor, q: Tensor, position: Tensor) -> Substeps:
+        world, kind = self.world, {"device": self.device, "dtype": self.world.dtype}
+        origin = self.setting.position.new_tensor(self.setting.lower)
+        cells = (position - origin.to(position.device)) / world.dx
+        self.cell = cells.floor()
+        self.offset = (cells - self.cell).to(**kind)
+        self.rest = position.to(**kind)
+        self.mass = self.setting.mass.to(position.device)[self.order].to(**kind)
+        self.volume = self.mass / world.density
+        real = _real(world.dtype)
+        pushes, nodes, steers, a, b = [], [], [], 0, 2
+        for row, (boundary, width) in enumerate(zip(self.boundaries, self.widths)):
+            for hooks, function in (
+                (pushes, boundary.acceleration(real)),
+                (nodes, boundary.node(real)),
+                (steers, boundary.steer(real)),
+            ):
+                if function is not None:
+                    hooks.append((function, a, b, row))
+            a, b = a + width, b + len(boundary.signals(0.0, 0.0))
+        selection = [boundary.selection(self.setting) for boundary in self.boundaries]
+        threads = self.threads
+        if threads is None:
+            threads = min(os.cpu_count() or 1, 8, 1 + len(position) // 4000)
+        return Substeps(
+            dx=world.dx,
+            origin=self.setting.lower,
+            gravity=world.gravity,
+            mass=self.mass,
+            volume=self.volume,
+            rest=self.rest,
+            cell=self.cell.to(torch.int32).contiguous(),
+            offset=self.offset,
+            coefficients=coefficients.contiguous(),
+            q=q,
+            selection=torch.stack(selection)[:, self.order.cpu()].to(**kind) if selection else torch.zeros(0, 0),
+            signals=b - 2,
+            pushes=tuple[Hook, ...](pushes),
+            nodes=tuple[Hook, ...](nodes),
+            steers=tuple[Hook, ...](steers),
+            material=world.material.advance(real),
+            memory_rows=world.material.memory_rows,
+            plastic=world.material.plastic,
+            longest_run=RUN,
+            threads=threads,
+        )
+
+
+class _Rollout(torch.autograd.Function):
+    """(coefficients [k, p], q, velocity [p, 3], position [p, 3]) -> displacement [t, p, 3], deformation [t, p, 3, 3]."""
+
+    @staticmethod
+    def forward(ctx, coefficients, q, velocity, position, solver: _Solver):
+        ctx.solver = solver
+        keep = any(ctx.needs_input_grad)
+        return solver.forward(coefficients.detach(), q.detach(), velocity.detach(), position.detach(), keep)
+
+    @staticmethod
+    def backward(ctx, adjoint_u, adjoint_F):
+        return (*ctx.solver.backward(adjoint_u, adjoint_F), None)
+
+
+def _check_inputs(position, volume, velocity, boundaries, frames: int, frame_dt: float) -> None:
+    n = len(position)
+    if n == 0 or position.shape != (n, 3):
+        raise ValueError(f"position has shape {tuple(position.shape)}; take [p, 3] with at least one particle")
+    if volume.shape != (n,):
+        raise ValueError(f"volume has shape {tuple(volume.shape)}; take one per particle, [{n}]")
+    require_finite("position", position)
+    require_finite("volume", volume)
+    if not bool((volume > 0).all()):
+        raise ValueError(
+            f"volume of {int((volume <= 0).sum())} of {n} particles is not above 0 m^3; drop those particles"
+        )
+    if velocity is not None:
+        require_finite("velocity", velocity)
+        if velocity.shape not in ((3,), (n, 3)):
+            raise ValueError(f"velocity has shape {tuple(velocity.shape)}; take [3] or [{n}, 3]")
+    if frames < 1:
+        raise ValueError(f"frames is {frames}; take at least 1 (frame 0 is the initial state)")
+    if not (0 < frame_dt < math.inf):
+        raise ValueError(f"frame_dt is {frame_dt} s; take a time above 0")
+    for boundary in boundaries:
+        boundary.check()
+
+
+def _region(world: World, position: Tensor, velocity: Tensor, duration: float) -> tuple[Vector, Vector]:
+    """Corners of the simulated region. Automatic: the body's own extent around it, and the way it falls or flies."""
+    x = position.detach().double().cpu()
+    low, high = x.amin(0), x.amax(0)
+    if world.lower is not None and world.upper is not None:
+        lower, upper = x.new_tensor(world.lower), x.new_tensor(world.upper)
+        outside = int(((x < lower) | (x > upper)).any(1).sum())
+        if outside:
+            raise ValueError(
+                f"{outside} of {len(x)} particles are outside the simulated region {world.lower} .. {world.upper} m at the "
+                "start; enlarge world.lower and world.upper or move the body"
+            )
+        return tuple(lower.tolist()), tuple(upper.tolist())
+    v = velocity.detach().double().cpu().reshape(-1, 3)
+    half_g = 0.5 * x.new_tensor(world.gravity) * duration**2
+    room = float((high - low).max()) + 4 * world.dx
+    low = torch.minimum(low, low + v.amin(0) * duration + half_g) - room
+    high = torch.maximum(high, high + v.amax(0) * duration + half_g) + room
+    # nodes at whole multiples of dx, so that a floor at z = 0 lies on nodes
+    return (
+        tuple(((low / world.dx).floor() * world.dx).tolist()),
+        tuple(((high / world.dx).ceil() * world.dx).tolist()),
+    )
+
+
+def _corners(setting: Setting) -> str:
+    return (
+        " .. ".join("(" + ", ".join(f"{x:.4g}" for x in corner) + ")" for corner in (setting.lower, setting.upper))
+        + " m"
+    )
+
+
+def _sorted_by_cell(position: Tensor, dx: float) -> Tensor:
+    """Permutation that puts particles of a cell, and then of a row and of a layer of cells, next to each other."""
+    cell = (position / dx).floor().long()
+    cell = cell - cell.amin(0)
+    size = cell.amax(0) + 1
+    return torch.argsort((cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2], stable=True)
+
+
+def _isolated(position: Tensor, dx: float) -> int:
+    """Particles with no other particle in their own cell or the 26 around it."""
+    cell = (position / dx).floor().long()
+    cell = cell - cell.amin(0) + 1
+    size = cell.amax(0) + 2
+    key = (cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2]
+    occupied, count = torch.unique(key, return_counts=True)
+    alone = occupied[count == 1]
+    lonely = torch.ones(len(alone), dtype=torch.bool, device=alone.device)
+    for step in _neighbours(int(size[1]), int(size[2])):
+        lonely &= ~torch.isin(alone + step, occupied)
+    return int(lonely.sum())
+
+
+def _neighbours(ny: int, nz: int) -> Iterator[int]:
+    for i in (-1, 0, 1):
+        for j in (-1, 0, 1):
+            for k in (-1, 0, 1):
+                if i or j or k:
+                    yield (i * ny + j) * nz + k
+
+
+def _real(dtype: torch.dtype):
+    import warp as wp
+
+    return wp.float32 if dtype == torch.float32 else wp.float64
