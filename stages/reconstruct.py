@@ -1,0 +1,113 @@
+"""Photographs -> 3D Gaussians."""
+
+from dataclasses import dataclass, field
+
+import torch
+
+from physics3d.gaussians.fit import Photograph, Rates, fit, from_points, held_out_psnr, random_points
+from physics3d.gaussians.model import Gaussians
+from physics3d.gaussians.ply import write_ply
+from physics3d.gaussians.render import render
+from physics3d.log import Log
+from physics3d.scenes.base import Capture
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reconstruct:
+    """Fit Gaussians to the photographs of a capture; also leaves `gaussians.ply` for any 3DGS viewer."""
+
+    iterations: int = 1500
+    max_gaussians: int = 20_000
+    sh_degree: int = 1  # 0: colour does not depend on the viewing direction
+    longest_side: int = 320  # photographs are reduced to this [px]
+    ssim_weight: float = 0.2
+    rates: Rates = field(default_factory=Rates)
+    densify_every: int = 100  # iterations between additions and removals of Gaussians
+    check_every: int = 250  # iterations between looks at the held-out photographs
+    patience: int = 3  # checks without improvement before it stops early
+    seed: int = 0
+    device: str = "cpu"
+
+    def __call__(self, capture: Capture, *, log: Log) -> Gaussians:
+        """Raises ValueError for settings out of range or a capture without photographs."""
+        self.check()
+        photographs = [p.to(self.device) for p in self.photographs(capture)]
+        training = [p for i, p in enumerate(photographs) if i not in capture.held_out]
+        held_out = [photographs[i] for i in capture.held_out]
+        background = torch.tensor(capture.background, device=self.device)
+        start = self.start(capture, [p.to("cpu") for p in training])
+        size = f"{photographs[0].camera.width} x {photographs[0].camera.height}"
+        log.info(
+            f"{len(training)} photographs at {size}, {len(held_out)} held out, {len(start)} Gaussians to start with"
+        )
+
+        def preview(model: Gaussians, step: int) -> None:
+            shown = (held_out or training)[0]
+            with torch.no_grad():
+                image = render(model, shown.camera, background=background).color
+            log.image("photograph_and_render", torch.cat([shown.on(background), image], 1), step)
+
+        gaussians = fit(
+            start,
+            training,
+            held_out,
+            background=background,
+            iterations=self.iterations,
+            max_gaussians=self.max_gaussians,
+            ssim_weight=self.ssim_weight,
+            rates=self.rates,
+            densify_every=self.densify_every,
+            check_every=self.check_every,
+            patience=self.patience,
+            seed=self.seed,
+            log=log,
+            preview=preview,
+        )
+        if held_out:
+            value = held_out_psnr(gaussians, held_out, background)
+            log.metric("psnr_held_out", value)
+            log.info(f"{len(gaussians)} Gaussians, {value:.2f} dB on photographs held out")
+        gaussians = gaussians.to("cpu")
+        if log.folder is not None:
+            write_ply(log.path("gaussians.ply"), gaussians)
+        return gaussians
+
+    def check(self) -> None:
+        for name in ("iterations", "max_gaussians", "densify_every", "check_every", "patience"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"reconstruct.{name} is {getattr(self, name)}; it must be at least 1")
+        if self.longest_side < 16:
+            raise ValueError(f"reconstruct.longest_side is {self.longest_side} px; it must be at least 16")
+        if self.sh_degree not in (0, 1, 2, 3):
+            raise ValueError(f"reconstruct.sh_degree is {self.sh_degree}; it must be 0, 1, 2 or 3")
+        if not 0 <= self.ssim_weight <= 1:
+            raise ValueError(f"reconstruct.ssim_weight is {self.ssim_weight}; it must lie in 0..1")
+
+    def photographs(self, capture: Capture) -> list[Photograph]:
+        """All photographs in floating point, reduced, multiplied by their matte where there is one."""
+        if not capture.images:
+            raise ValueError(f"capture {capture.name} has no photographs to reconstruct from")
+        behind = torch.tensor(capture.background)
+        result = []
+        for i, (image, camera) in enumerate(zip(capture.images, capture.cameras)):
+            color, alpha = image.float() / 255, None
+            if capture.alphas:
+                alpha = capture.alphas[i].float() / 255
+                color = (color - (1 - alpha)[..., None] * behind).clamp(0, 1)
+            photograph = Photograph(camera=camera, color=color, alpha=alpha)
+            factor = self.longest_side / max(camera.width, camera.height)
+            result.append(photograph.scaled(factor) if factor < 1 else photograph)
+        return result
+
+    def start(self, capture: Capture, training: list[Photograph]) -> Gaussians:
+        """From the capture's points if there are any, else from random points that the cameras have in common."""
+        generator = torch.Generator().manual_seed(self.seed)
+        count = max(1, self.max_gaussians // 2)
+        if capture.points is None:
+            points, colors = random_points(training, count, generator)
+        else:
+            pick = torch.randperm(len(capture.points), generator=generator)[:count]
+            points = capture.points[pick]
+            gray = torch.full_like(points, 0.5)
+            colors = gray if capture.point_colors is None else capture.point_colors[pick]
+        return from_points(points, colors, sh_degree=self.sh_degree)
