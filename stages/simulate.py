@@ -1,0 +1,101 @@
+"""Particles and their material -> trajectory."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+
+from physics3d.filling import Body
+from physics3d.log import Log
+from physics3d.mpm.boundaries.base import AbstractBoundary
+from physics3d.mpm.rollout import Trajectory, rollout
+from physics3d.mpm.world import Estimate, World
+
+
+@dataclass(frozen=True, kw_only=True)
+class Simulate:
+    """Rolls the body out under the world's boundaries and what excites it here."""
+
+    world: World
+    frames: int  # with frame 0, the initial state
+    fps: float  # [1/s]
+    excitation: tuple[AbstractBoundary, ...] = ()
+    device: str = "cpu"
+
+    def __call__(self, body: Body, estimate: Estimate, *, log: Log) -> Trajectory:
+        """Raises ValueError as `rollout` does, or if fps is not a rate above 0."""
+        if not 0 < self.fps < math.inf:
+            raise ValueError(f"simulate.fps is {self.fps}; take a rate above 0 1/s")
+        with torch.no_grad():
+            trajectory = rollout(
+                self.world,
+                estimate.parameters,
+                body.position,
+                body.volume,
+                velocity=estimate.velocity,
+                excitation=tuple(self.excitation),
+                frames=self.frames,
+                frame_dt=1 / self.fps,
+                device=self.device,
+                log=log,
+            )
+        trajectory = _on_cpu(trajectory)
+        for name, curve in trajectory.health.items():
+            for frame, value in enumerate(curve):
+                log.metric(f"health/{name}", value, frame)
+        mass = self.world.density * float(body.volume.sum())
+        log.metric("mass", mass)
+        log.metric("substeps_per_frame", trajectory.substeps)
+        log.info(
+            f"{len(body.position)} particles, {mass:.3g} kg, {self.frames} frames of up to "
+            f"{trajectory.substeps} substeps (shortest {trajectory.substep_dt:.2e} s)"
+        )
+        _report(trajectory, log)
+        log.image("motion", _plot(trajectory))
+        return trajectory
+
+
+def _on_cpu(trajectory: Trajectory) -> Trajectory:
+    return Trajectory(
+        rest_position=trajectory.rest_position.cpu(),
+        position=trajectory.position.cpu(),
+        deformation=trajectory.deformation.cpu(),
+        fps=trajectory.fps,
+        health=trajectory.health,
+        substeps=trajectory.substeps,
+        substep_dt=trajectory.substep_dt,
+    )
+
+
+def _report(trajectory: Trajectory, log: Log) -> None:
+    """Say what looks unwell."""
+    health = trajectory.health
+    worst = int(max(health["inverted"]))
+    if worst:
+        log.warn(f"up to {worst} particles are turned inside out; take a smaller cfl, a smaller dx or a weaker force")
+    lonely = int(health["isolated"][0])
+    if lonely:
+        log.warn(f"{lonely} particles have no neighbour within a cell and move alone; fill more densely or enlarge dx")
+
+
+def _plot(trajectory: Trajectory):
+    """Mean displacement and that of the particle that moves most, over time, beside the energies."""
+    from matplotlib.figure import Figure
+
+    moved = trajectory.position - trajectory.rest_position
+    distance = moved.norm(dim=2)
+    tip = int(distance.amax(0).argmax())
+    time = torch.arange(len(moved)) / trajectory.fps
+    figure = Figure(figsize=(10, 3.6), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    for axis, name in enumerate("xyz"):
+        left.plot(time, moved[:, tip, axis], color=f"C{axis}", label=f"tip, {name}")
+        left.plot(time, moved[:, :, axis].mean(1), color=f"C{axis}", linestyle="--", label=f"mean, {name}")
+    left.set(xlabel="time [s]", ylabel="displacement [m]")
+    left.legend(fontsize="small")
+    for name in ("kinetic", "elastic", "potential"):
+        curve = torch.tensor(trajectory.health[f"{name}_energy"])
+        right.plot(time, curve - curve[0], label=name)
+    right.set(xlabel="time [s]", ylabel="energy since the start [J]")
+    right.legend(fontsize="small")
+    return figure
