@@ -1,0 +1,99 @@
+"""What is learned: a short vector theta of dimensionless offsets, zero at the start, from which all physical values
+follow.
+
+    p = p_0 exp(theta)              moduli [Pa], times [s], anything positive
+    K/mu = (K/mu)_0 exp(theta)      Poisson's ratio, through K/mu = 2 (1 + nu) / (3 (1 - 2 nu)): it stays in (-1, 0.5)
+    v = v_0 + c theta               initial velocity, c [m/s] a natural speed of the scene
+
+A step of 0.1 is a change of ten per cent, whatever the unit, and all components are comparable: no scaling of
+gradients by hand, and a Gaussian prior on theta is a log-normal one on the material. Tied parameters share one
+component of theta.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+AXES = ("velocity_x", "velocity_y", "velocity_z")
+
+
+@dataclass(frozen=True, kw_only=True)
+class GlobalField:
+    """One number per parameter for the whole body."""
+
+    start: dict[str, Tensor]  # physical name -> scalar or [p], SI; everything the material needs, learned or not
+    learn: tuple[str, ...]  # names that may change
+    ties: tuple[tuple[str, ...], ...] = ()  # groups that share one factor; their members are then learned too
+    span: float = 100.0  # a value stays within start/span .. start*span
+    start_velocity: Tensor = field(default_factory=lambda: torch.zeros(3))  # [3] [m/s]
+    velocity_scale: float | None = None  # c [m/s]; None: the velocity is not learned
+
+    def __post_init__(self):
+        known = ", ".join(self.start)
+        for name in (*self.learn, *(n for tie in self.ties for n in tie)):
+            if name not in self.start:
+                raise ValueError(
+                    f"learn.learn or learn.ties names {name!r}; the parameters of this material are {known}"
+                )
+        groups = self.groups
+        members = [name for group in groups for name in group]
+        if len(set(members)) != len(members):
+            raise ValueError(
+                f"learn.learn = {self.learn} and learn.ties = {self.ties} name a parameter twice; name each once"
+            )
+        if not groups and self.velocity_scale is None:
+            raise ValueError(f"nothing to learn: set learn.learn to some of {known}, or learn.learn_velocity")
+        if not self.span > 1:
+            raise ValueError(f"learn.span is {self.span:g}; it must be above 1, e.g. 100")
+        for name in members:
+            if name != "poissons_ratio" and not bool((torch.as_tensor(self.start[name]) > 0).all()):
+                raise ValueError(
+                    f"{name} starts at {float(torch.as_tensor(self.start[name]).min()):g} and is learned as a "
+                    "logarithm; start it above 0 or take it out of learn.learn"
+                )
+        if any("poissons_ratio" in group and len(group) > 1 for group in groups):
+            raise ValueError("learn.ties holds poissons_ratio; it has no scale to share, learn it by itself")
+
+    @property
+    def groups(self) -> tuple[tuple[str, ...], ...]:
+        """The parameters behind each material component of theta."""
+        tied = {name: tie for tie in self.ties for name in tie}
+        return tuple(dict.fromkeys([*(tied.get(name, (name,)) for name in self.learn), *self.ties]))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """One name per component of theta; tied ones are joined by +."""
+        return tuple("+".join(group) for group in self.groups) + (AXES if self.velocity_scale is not None else ())
+
+    def zero(self) -> Float[Tensor, " k"]:
+        """theta at the start."""
+        return torch.zeros(len(self.names), dtype=torch.float64)
+
+    def bound(self, theta: Float[Tensor, " k"]) -> Float[Tensor, " k"]:
+        """The nearest theta within the span; velocities are not bounded."""
+        limit, count = math.log(self.span), len(self.groups)
+        return torch.cat([theta[:count].clamp(-limit, limit), theta[count:]])
+
+    def parameters(self, theta: Float[Tensor, " k"]) -> dict[str, Tensor]:
+        """All physical parameters, differentiable in theta."""
+        values = {name: torch.as_tensor(value, dtype=theta.dtype) for name, value in self.start.items()}
+        for offset, group in zip(theta, self.groups):
+            for name in group:
+                values[name] = (
+                    poissons_ratio(values[name], offset) if name == "poissons_ratio" else values[name] * offset.exp()
+                )
+        return values
+
+    def velocity(self, theta: Float[Tensor, " k"]) -> Float[Tensor, " 3"]:
+        """Initial velocity [m/s], differentiable in theta."""
+        start = self.start_velocity.to(theta)
+        return start if self.velocity_scale is None else start + self.velocity_scale * theta[-3:]
+
+
+def poissons_ratio(start: Tensor, offset: Tensor) -> Tensor:
+    """Poisson's ratio whose K/mu is exp(offset) times that of `start`."""
+    ratio = 2 * (1 + start) / (3 * (1 - 2 * start)) * offset.exp()
+    return (3 * ratio - 2) / (2 * (3 * ratio + 1))
