@@ -3,9 +3,9 @@
     rollout(world, parameters, position, volume, ...) -> Trajectory
 
 Time step. Waves cross a cell in dx/(c + |v|), with rho c^2 the wave modulus of the material times the current stretch
-squared; a lone particle, whose stress comes back undiluted, needs dt < dx/(sqrt(3) c) (its three axes act together; Sun,
-Shinar and Schroeder 2020). An automatic substep is cfl times the former and at most 0.95 times the latter. Every frame has
-a whole number of equal substeps; a frame that turns out too fast for its substeps is done again with more.
+squared; a lone particle, whose stress comes back undiluted, needs dt < dx/(sqrt(3) c) (its three axes act together;
+Sun, Shinar and Schroeder 2020). An automatic substep is cfl times the former and at most 0.95 times the latter. Every
+frame has a whole number of equal substeps; a frame that turns out too fast for its substeps is done again with more.
 
 Gradients. The exact adjoint of the discrete trajectory: the state is kept at every RUN-th substep, and the reverse pass
 recomputes the substeps in between, run by run, with the same dt and the same windows.
@@ -48,8 +48,8 @@ class Trajectory(AbstractArtifact):
         t, p = self.position.shape[:2]
         if self.rest_position.shape != (p, 3) or self.deformation.shape != (t, p, 3, 3):
             raise ValueError(
-                f"trajectory: rest_position {tuple(self.rest_position.shape)}, position {tuple(self.position.shape)} and "
-                f"deformation {tuple(self.deformation.shape)} disagree; expected [p, 3], [t, p, 3], [t, p, 3, 3]"
+                f"trajectory: rest_position {tuple(self.rest_position.shape)}, position {tuple(self.position.shape)} "
+                f"and deformation {tuple(self.deformation.shape)} disagree; expected [p, 3], [t, p, 3], [t, p, 3, 3]"
             )
         require_finite("trajectory.position", self.position)
         require_finite("trajectory.deformation", self.deformation)
@@ -71,10 +71,10 @@ def rollout(
 ) -> Trajectory:
     """Simulate `frames` frames, frame 0 being the initial state, frame_dt [s] apart.
 
-    `position` [m] at rest, `volume` [m^3] at rest, `velocity` [m/s] at the start (None: at rest), `parameters` SI, each a
-    scalar or one number per particle. The trajectory is differentiable with respect to parameters, velocity, position and the
-    forces of boundaries where these are tensors that require it. `threads` (CPU): None takes both cores where there are enough
-    particles. Raises ValueError naming the field, the value and the remedy."""
+    `position` [m] at rest, `volume` [m^3] at rest, `velocity` [m/s] at the start (None: at rest), `parameters` SI, each
+    a scalar or one number per particle. The trajectory is differentiable with respect to parameters, velocity, position
+    and the forces of boundaries where these are tensors that require it. `threads` (CPU only): None takes as many cores
+    as there are particles to fill. Raises ValueError naming the field, the value and the remedy."""
     world.check()
     boundaries = (*world.boundaries, *excitation)
     _check_inputs(position, volume, velocity, boundaries, frames, frame_dt)
@@ -292,7 +292,7 @@ class _Solver:
         return (mean + 2 * p * torch.cos(torch.acos(r) / 3)).clamp(min=0).sqrt(), torch.linalg.det(F)
 
     def _speeds(self, now) -> tuple[float, float]:
-        """(fastest wave, fastest particle) [m/s]. Stretched by s, waves are s times faster; strong compression stiffens."""
+        """(fastest wave, fastest particle) [m/s]. Waves are s times faster at stretch s; strong compression stiffens."""
         stretch, J = self._stretch(now)
         stiffening = stretch.clamp(min=1) * (1 - J.clamp(1e-4, 1).log()).sqrt()
         c = ((self.modulus.double() / self.world.density).sqrt() * stiffening).max()
@@ -400,7 +400,7 @@ class _Solver:
 
 
 class _Rollout(torch.autograd.Function):
-    """(coefficients [k, p], q, velocity [p, 3], position [p, 3]) -> displacement [t, p, 3], deformation [t, p, 3, 3]."""
+    """(coefficients [k, p], q, velocity and position [p, 3]) -> displacement [t, p, 3], deformation [t, p, 3, 3]."""
 
     @staticmethod
     def forward(ctx, coefficients, q, velocity, position, solver: _Solver):
@@ -446,8 +446,8 @@ def _region(world: World, position: Tensor, velocity: Tensor, duration: float) -
         outside = int(((x < lower) | (x > upper)).any(1).sum())
         if outside:
             raise ValueError(
-                f"{outside} of {len(x)} particles are outside the simulated region {world.lower} .. {world.upper} m at the "
-                "start; enlarge world.lower and world.upper or move the body"
+                f"{outside} of {len(x)} particles are outside the simulated region {world.lower} .. {world.upper} m at "
+                "the start; enlarge world.lower and world.upper or move the body"
             )
         return tuple(lower.tolist()), tuple(upper.tolist())
     v = velocity.detach().double().cpu().reshape(-1, 3)

@@ -1,6 +1,7 @@
 """What a particle carries from one substep to the next, all in one flat buffer.
 
-One buffer per state makes a checkpoint one copy and clearing an adjoint one fill. Torch owns the memory, Warp sees the same bytes.
+One buffer per state makes a checkpoint one copy and clearing an adjoint one fill. Torch owns the memory, Warp sees the
+same bytes.
 """
 
 from dataclasses import dataclass, field

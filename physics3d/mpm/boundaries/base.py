@@ -4,9 +4,9 @@
     node           velocity of a grid node -> velocity of that node                 (walls, colliders, held regions)
     steer          velocity and its gradient of selected particles after the gather  (motion imposed on the body itself)
 
-The solver calls whatever is there, in the order of the list, and never asks which one it has. A boundary's numbers are of two
-kinds: `parameters` are constant during a rollout, differentiable, and travel in one vector; `signals` depend on time and are
-computed on the host in float64 for every substep, so that a window in time is exact whatever the substep is.
+The solver calls whatever is there, in the order of the list, and never asks which one it has. A boundary's numbers are of
+two kinds: `parameters` are constant during a rollout, differentiable, and travel in one vector; `signals` depend on time
+and are computed on the host in float64 for every substep, so that a window in time is exact whatever the substep is.
 """
 
 import abc
@@ -36,12 +36,12 @@ class Setting:
 class AbstractBoundary(abc.ABC):
     """A boundary condition; its fields are SI numbers.
 
-    The Warp functions of a boundary (memoised by their arguments, so that equal boundaries share one) have the signatures
+    The Warp functions of a boundary (memoised by their arguments, so that equal boundaries share one) are
         node(x: vec3, v: vec3, q: array[real], a: int, clock: array2d[real], row: int, b: int) -> vec3
         acceleration(weight: real, x: vec3, q, a, clock, row, b) -> vec3
         steer(weight: real, x: vec3, v: vec3, L: mat33, q, a, clock, row, b) -> (vec3, mat33)
-    where q[a + i] is its i-th parameter, clock[row, b + i] its i-th signal in this substep, clock[row, 0] is dt, x is in
-    metres, and weight what `selection` gave for the particle (never 0 in a call).
+    where q[a + i] is its i-th parameter, clock[row, b + i] its i-th signal in this substep, clock[row, 0] is dt, x is
+    in metres, and weight what `selection` gave for the particle (never 0 in a call).
     """
 
     @abc.abstractmethod

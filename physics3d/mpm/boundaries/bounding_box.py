@@ -1,7 +1,7 @@
 """Bounding box: six walls around the simulated region, or around a box of one's own.
 
-On nodes at or beyond a wall: sticky, v = 0; slip, no velocity across the wall; separate, none outwards. A corner obeys all its
-walls. Nothing passes, so particles cannot leave the region.
+On nodes at or beyond a wall: sticky, v = 0; slip, no velocity across the wall; separate, none outwards. A corner obeys
+all its walls. Nothing passes, so particles cannot leave the region.
 """
 
 import functools

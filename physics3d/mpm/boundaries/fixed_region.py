@@ -46,9 +46,10 @@ def _node(real: type) -> wp.Function:
         b: int,
     ):
         result = v
-        if x[0] >= q[a] and x[1] >= q[a + 1] and x[2] >= q[a + 2]:
-            if x[0] <= q[a + 3] and x[1] <= q[a + 4] and x[2] <= q[a + 5]:
-                result = vec3()
+        above = x[0] >= q[a] and x[1] >= q[a + 1] and x[2] >= q[a + 2]
+        below = x[0] <= q[a + 3] and x[1] <= q[a + 4] and x[2] <= q[a + 5]
+        if above and below:
+            result = vec3()
         return result
 
     return node

@@ -1,6 +1,6 @@
 """Impulse: a total force on the particles of a ball, for some time; a poke, a gust, the start of every paper video.
 
-    a(t) = force / m(ball)   for the particles that are within `radius` of `centre` AT REST,  start <= t < start + duration
+    a(t) = force / m(ball),  start <= t < start + duration,  for the particles within `radius` of `centre` AT REST
 
 The force follows the material, and the momentum it gives is force * duration exactly, whatever the substep.
 """
@@ -21,8 +21,8 @@ from physics3d.mpm.transfer import vector
 class Impulse(base.AbstractBoundary):
     """Total force [N] over a ball (centre, radius [m]) of rest positions in a window of time [s].
 
-    The force may be a tensor of three, and the trajectory is differentiable with respect to it. For a momentum P [N s] take
-    force = P/duration."""
+    The force may be a tensor of three, and the trajectory is differentiable with respect to it. For a momentum P [N s]
+    take force = P/duration."""
 
     force: base.Vector | Tensor
     centre: base.Vector
