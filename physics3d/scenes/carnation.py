@@ -1,0 +1,136 @@
+"""The carnation twin: a potted carnation made by code, photographed from all sides and poked.
+
+The flower stands in a terracotta pot on a wooden table. Everything above the soil moves, everything below it is fixed.
+What deforms is one viscoelastic solid: the stem, the calyx, the leaves (thin) and the dome that the petals fill; the
+visible petals and sepals are thin sheets carried by it. The stem is kept thick so that cells of 1.2 to 1.5 cm resolve
+its bending. The photographed shape is the rest shape, so there is no gravity.
+
+The motion is computed by the project's own solver, but with a finer grid, other particles and other time steps than the
+pipeline takes, and the pictures are ray traced from meshes: learning has to see through both differences.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from physics3d.gaussians.cameras import Camera
+from physics3d.mpm.boundaries.fixed_region import FixedRegion
+from physics3d.mpm.boundaries.impulse import Impulse
+from physics3d.mpm.materials.viscoelastic import Viscoelastic
+from physics3d.mpm.world import World
+from physics3d.scenes.base import AbstractSource, Capture
+from physics3d.scenes.flower import SOIL, blossom_centre, plant, surroundings
+from physics3d.scenes.photographs import held_out
+from physics3d.scenes.studio import Light, Studio, photographs, ring
+from physics3d.scenes.synthetic import film, particles
+
+
+@dataclass(frozen=True, kw_only=True)
+class CarnationTwin(AbstractSource):
+    # what is photographed
+    views: int = 40
+    width: int = 320  # [px]
+    height: int = 240  # [px]
+    held_out_every: int = 8  # every so many photographs are kept for evaluation
+    points: int = 5000  # surface points, as from structure from motion
+    # what moves, and how it is recorded
+    frames: int = 30  # of each take, the rest state included
+    fps: float = 30.0  # [1/s]
+    learn_force: tuple[float, float, float] = (0.09, 0.02, 0.0)  # on the blossom in the take to learn from [N]
+    evaluate_force: tuple[float, float, float] = (-0.05, 0.06, 0.02)  # in the take that is held out [N]
+    push: float = 0.1  # duration of the push, from the first frame [s]
+    # the truth
+    youngs_modulus: float = 2.0e5  # of the elastic branch [Pa]
+    poissons_ratio: float = 0.3
+    branch_shear_modulus: float = 4.0e4  # mu_N [Pa]
+    branch_bulk_modulus: float = 8.0e4  # K_N [Pa]
+    shear_viscosity_time: float = 0.15  # 1/k_d [s]
+    bulk_viscosity_time: float = 0.15  # 1/k_v [s]
+    density: float = 300.0  # petals hold much air [kg/m^3]
+    # how the reference motion is computed: finer than the pipeline
+    dx: float = 0.0085  # cell of the grid [m]
+    seed: int = 0
+    device: str = "cpu"
+
+    def files(self) -> tuple[str, ...]:
+        return ()
+
+    def __call__(self, *, log) -> Capture:
+        meshes, solids = plant(self.seed)
+        light = Light(backdrop=(0.80, 0.83, 0.86))
+        studio = Studio([*meshes, *surroundings(self.seed)], light, openness_rays=24, seed=self.seed)
+        cameras = photographers(self.views, self.width, self.height)
+        images, _, points, colors = photographs(
+            studio.pose(), cameras, points=self.points, noise=4e-4, seed=self.seed, log=log
+        )
+        position, volume = particles(solids, self.dx / 2, self.seed)
+        (witness,) = ring(
+            TARGET, distance=0.5, elevation=14, azimuths=[-84], width=self.width, height=self.height, opening=OPENING
+        )
+        takes = [
+            film(
+                role=role,
+                world=self.world(),
+                excitation=(
+                    Impulse(force=tuple(force), centre=blossom_centre(), radius=0.05, start=0.0, duration=self.push),
+                ),
+                position=position,
+                volume=volume,
+                studio=studio,
+                cameras=[witness],
+                frames=self.frames,
+                fps=self.fps,
+                device=self.device,
+                log=log,
+            )
+            for role, force in (("learn", self.learn_force), ("evaluate", self.evaluate_force))
+        ]
+        capture = Capture(
+            name="carnation",
+            images=tuple(images),
+            cameras=tuple(cameras),
+            names=tuple(f"view_{i:03d}" for i in range(len(cameras))),
+            held_out=held_out(len(images), self.held_out_every),
+            background=light.backdrop,
+            points=points,
+            point_colors=colors,
+            takes=tuple(takes),
+            truth=self.world().start,
+            truth_source="set in the code that made this twin",
+            note=(
+                "this is a synthetic twin: flower, photographs and motion are made by code, so its material is known; "
+                "for a real capture set scene.source to a folder of photographs with cameras (see README)"
+            ),
+        )
+        capture.check()
+        return capture
+
+    def world(self) -> World:
+        """The physics that the reference motion obeys, with the true parameters as start."""
+        material = Viscoelastic()
+        return World(
+            material=material,
+            density=self.density,
+            start={name: getattr(self, name) for name in material.parameters},
+            dx=self.dx,
+            gravity=(0.0, 0.0, 0.0),
+            boundaries=(FixedRegion(lower=(-0.1, -0.1, -0.1), upper=(0.1, 0.1, SOIL)),),
+        )
+
+
+TARGET = (0.012, 0.0, 0.137)  # what cameras look at [m]
+OPENING = 44.0  # of the lens, across [deg]
+
+
+def photographers(views: int, width: int, height: int) -> list[Camera]:
+    """Cameras on three rings around the front of the flower, never behind the backdrop."""
+    rings = ((14.0, 0.45), (32.0, 0.35), (58.0, 0.20))  # elevation [deg], share of the views
+    counts = [round(views * share) for _, share in rings]
+    counts[0] += views - sum(counts)
+    cameras = []
+    for i, ((elevation, _), count) in enumerate(zip(rings, counts)):
+        azimuths = -90 + np.linspace(-112, 112, count) + 4 * (i - 1)
+        cameras += ring(
+            TARGET, distance=0.5, elevation=elevation, azimuths=azimuths, width=width, height=height, opening=OPENING
+        )
+    return cameras

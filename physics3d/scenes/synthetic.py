@@ -1,0 +1,135 @@
+"""Synthetic twins: the motion of meshes, computed by a simulation whose material is known, and filmed.
+
+Solids are sampled with particles of their own, and vertices follow the particles by
+
+    x(X) = sum_i w_i (x_i + F_i (X - X_i)),     w_i ~ exp(-|X - X_i|^2 / h^2) over the nearest,    sum_i w_i = 1
+
+which is exact for affine motion.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32
+from torch import Tensor
+
+from physics3d.gaussians.cameras import Camera
+from physics3d.mpm.boundaries.base import AbstractBoundary
+from physics3d.mpm.rollout import rollout
+from physics3d.mpm.world import World
+from physics3d.open3d_import import open3d
+from physics3d.scenes.base import Take
+from physics3d.scenes.studio import Mesh, Studio
+
+
+def film(
+    *,
+    role: str,
+    world: World,
+    excitation: tuple[AbstractBoundary, ...],
+    position: Float32[np.ndarray, "p 3"],
+    volume: Float32[np.ndarray, " p"],
+    studio: Studio,
+    cameras: list[Camera],
+    frames: int,
+    fps: float,
+    device: str,
+    log,
+) -> Take:
+    """Simulate the particles with the parameters `world.start`, and photograph the meshes that follow them."""
+    trajectory = rollout(
+        world,
+        world.estimate().parameters,
+        torch.from_numpy(position),
+        torch.from_numpy(volume),
+        excitation=excitation,
+        frames=frames,
+        frame_dt=1 / fps,
+        device=device,
+        log=log,
+    )
+    trajectory.check()
+    carrier = Carrier(studio.rest(), position, world.dx)
+    videos: list[list[Tensor]] = [[] for _ in cameras]
+    furthest = 0.0
+    for t in log.progress(range(frames), f"filming the take to {role}"):
+        moved = carrier(trajectory.position[t].cpu().numpy(), trajectory.deformation[t].cpu().numpy())
+        furthest = max(furthest, float(np.linalg.norm(moved - studio.rest(), axis=1).max()))
+        pose = studio.pose(moved)
+        for camera, video in zip(cameras, videos):
+            video.append(pose.photograph(camera)[0])
+    log.info(
+        f"take to {role}: {len(position)} particles, {1e6 * volume.sum():.0f} cm^3, cells of {1e3 * world.dx:.2g} mm, "
+        f"substeps of {trajectory.substep_dt:.2g} s, moves by up to {1e3 * furthest:.0f} mm"
+    )
+    return Take(
+        name=role,
+        role=role,
+        fps=fps,
+        cameras=tuple(cameras),
+        videos=tuple(torch.stack(v) for v in videos),
+        excitation=excitation,
+    )
+
+
+def particles(
+    solids: list[tuple[Mesh, float]], spacing: float, seed: int
+) -> tuple[Float32[np.ndarray, "p 3"], Float32[np.ndarray, " p"]]:
+    """Material points of the reference motion: position [m], volume [m^3].
+
+    `solids` are closed meshes with thickness 0, or sheets with their thickness [m]. Closed ones get one jittered point
+    per cube of side `spacing` [m], counted once where they overlap; sheets get points on their surface, about one per
+    spacing^2, each with its share of area * thickness.
+    """
+    o3d = open3d()
+    rng = np.random.default_rng(seed)
+    closed = [mesh for mesh, thickness in solids if not thickness]
+    lower, upper = (f([f(m.vertices, 0) for m in closed], 0) for f in (np.min, np.max))
+    axes = [np.arange(a - spacing * rng.random(), b + spacing, spacing) for a, b in zip(lower, upper)]
+    lattice = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    lattice = (lattice + 0.7 * spacing * (rng.random(lattice.shape) - 0.5)).astype(np.float32)
+    inside = np.zeros(len(lattice), bool)
+    for mesh in closed:
+        scene = o3d.t.geometry.RaycastingScene()
+        scene.add_triangles(o3d.core.Tensor(mesh.vertices), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
+        inside |= scene.compute_occupancy(o3d.core.Tensor(lattice), nsamples=3).numpy() > 0.5
+    position, volume = [lattice[inside]], [np.full(inside.sum(), spacing**3)]
+    for mesh, thickness in solids:
+        if thickness:
+            a, b, c = (mesh.vertices[mesh.faces[:, i]].astype(np.float64) for i in range(3))
+            area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+            count = max(1, round(area.sum() / spacing**2))
+            face = rng.choice(len(area), count, p=area / area.sum())
+            u, v = rng.random((2, count, 1))
+            u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+            position.append(a[face] + u * (b - a)[face] + v * (c - a)[face])
+            volume.append(np.full(count, area.sum() * thickness / count))
+    return np.concatenate(position).astype(np.float32), np.concatenate(volume).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Carrier:
+    """Which particles carry which vertices, fixed in the rest state."""
+
+    rest: Float[np.ndarray, "v 3"]
+    particles: Float[np.ndarray, "p 3"]
+    reach: float  # h of the weights [m]
+    neighbours: np.ndarray = field(init=False)  # [v, k]
+    weights: np.ndarray = field(init=False)  # [v, k]
+
+    def __post_init__(self):
+        from scipy.spatial import cKDTree
+
+        distance, index = cKDTree(self.particles).query(self.rest, k=min(12, len(self.particles)))
+        distance, index = distance.reshape(len(self.rest), -1), index.reshape(len(self.rest), -1)
+        # relative to the nearest, so that a vertex far outside keeps its weights
+        weight = np.exp(-(distance**2 - distance[:, :1] ** 2) / self.reach**2)
+        object.__setattr__(self, "neighbours", index)
+        object.__setattr__(self, "weights", weight / weight.sum(1, keepdims=True))
+
+    def __call__(self, x: Float[np.ndarray, "p 3"], F: Float[np.ndarray, "p 3 3"]) -> Float32[np.ndarray, "v 3"]:
+        """Vertices when the particles are at `x` with total deformation `F`."""
+        offset = self.rest[:, None] - self.particles[self.neighbours]
+        moved = x[self.neighbours] + np.einsum("vkij,vkj->vki", F[self.neighbours], offset)
+        return (self.weights[..., None] * moved).sum(1).astype(np.float32)
