@@ -158,7 +158,7 @@ class _Advance(torch.autograd.Function):
         wp.init()
         n, real = len(H), _REAL[H.dtype]
         inputs = [t.detach().contiguous() for t in (L, H, coefficients.expand(-1, n), memory)]
-        outputs = [torch.zeros_like(H), torch.zeros_like(H), torch.zeros_like(inputs[3])]
+        outputs = [torch.zeros_like(t) for t in (inputs[1], inputs[1], inputs[3])]
         ctx.launch = functools.partial(_launch, _kernel(material.advance(real), real), n, real(dt), real)
         ctx.columns = coefficients.shape[1]
         ctx.save_for_backward(*inputs, *outputs)
@@ -169,7 +169,9 @@ class _Advance(torch.autograd.Function):
     def backward(ctx, *adj_outputs):
         saved = list(ctx.saved_tensors)
         adj_inputs = [torch.zeros_like(t) for t in saved[:4]]
-        ctx.launch(saved[:4], saved[4:], adj_inputs, [t.contiguous().clone() for t in adj_outputs])
+        ctx.launch(
+            saved[:4], saved[4:], adj_inputs, [t.clone(memory_format=torch.contiguous_format) for t in adj_outputs]
+        )
         L, H, coefficients, memory = adj_inputs
         if ctx.columns == 1:
             coefficients = coefficients.sum(1, keepdim=True)
@@ -180,7 +182,7 @@ def _launch(kernel, n, dt, real, inputs, outputs, adj_inputs=None, adj_outputs=N
     mat33 = spectral.matrix_type(real)
 
     def arrays(tensors, types):
-        return [wp.from_torch(t, dtype=kind) for t, kind in zip(tensors, types, strict=True)]
+        return [wp.from_torch(t.detach(), dtype=kind) for t, kind in zip(tensors, types, strict=True)]
 
     in_types, out_types = (mat33, mat33, real, real), (mat33, mat33, real)
     adjoint = adj_inputs is not None

@@ -116,6 +116,57 @@ def log1p_extended(real: type, floor: float) -> wp.Function:
 
 
 @functools.cache
+def log_det(real: type) -> wp.Function:
+    """ln det(I + X) of a positive semidefinite I + X, its tangent below det = 1e-12 (all lengths a hundredth)."""
+    mat33 = matrix_type(real)
+    volume_change_, cofactor_, log1p_ = volume_change(real), cofactor(real), log1p(real)
+    floor = real(1e-12)
+
+    @wp.func(name=f"log_det_{real.__name__}")
+    def log_det(X: mat33):
+        change = volume_change_(X)
+        if wp.abs(change) < real(0.5):
+            return log1p_(change)
+        det = wp.determinant(wp.identity(n=3, dtype=real) + X)
+        above = wp.max(det, floor)
+        return wp.log(above) + (det - above) / floor
+
+    @wp.func_grad(log_det)
+    def adj_log_det(X: mat33, adj_ret: real):
+        A = wp.identity(n=3, dtype=real) + X
+        wp.adjoint[X] += adj_ret / wp.max(wp.determinant(A), floor) * cofactor_(A)
+
+    return log_det
+
+
+@functools.cache
+def unimodular_inverse(real: type) -> wp.Function:
+    """det(A)^(1/3) A^-1 - I of a positive semidefinite A = I + X."""
+    mat33 = matrix_type(real)
+    log_det_, cofactor_, expm1_ = log_det(real), cofactor(real), expm1(real)
+    lowest = real(math.log(1e-12))
+
+    @wp.func(name=f"unimodular_inverse_{real.__name__}")
+    def unimodular_inverse(X: mat33):
+        one = wp.identity(n=3, dtype=real)
+        A = one + X
+        third = wp.max(log_det_(X), lowest) / real(3.0)
+        if wp.ddot(X, X) < real(0.1):
+            c = expm1_(third)
+            return c * one - (real(1.0) + c) * (X * wp.inverse(A))
+        return wp.exp(-real(2.0) * third) * cofactor_(A) - one  # cof A = det(A) A^-1: A is symmetric
+
+    @wp.func_grad(unimodular_inverse)
+    def adj_unimodular_inverse(X: mat33, adj_ret: mat33):
+        Z = wp.identity(n=3, dtype=real) + unimodular_inverse(X)
+        G = real(0.5) * (adj_ret + wp.transpose(adj_ret))
+        scale = wp.exp(-wp.max(log_det_(X), lowest) / real(3.0))
+        wp.adjoint[X] += scale * (wp.ddot(G, Z) / real(3.0) * Z - Z * G * Z)
+
+    return unimodular_inverse
+
+
+@functools.cache
 def stretch(real: type) -> wp.Function:
     """Y = V - I of the left polar decomposition I + H = V R; R is a rotation also when J < 0.
 
@@ -165,14 +216,18 @@ def stretch(real: type) -> wp.Function:
         i1 = wp.ddot(F, F)
         i2 = wp.ddot(C, C)
         l = wp.sqrt(real(3.0) * i1)
+        least_D = least * i1 * wp.sqrt(i1)
+        D = real(0.5) * (l * l - i1) * l - J
         for _ in range(30):  # monotone from above; quadratic unless D = 0
+            if D - least_D <= real(0.0):
+                break
             II = real(0.5) * (l * l - i1)
-            slope = real(2.0) * (II * l - J)
-            step = (II * II - i2 - real(2.0) * J * l) / wp.max(slope, real(1e-30))
+            step = (II * II - i2 - real(2.0) * J * l) / (real(2.0) * D)
             l = l - wp.max(step, real(0.0))
+            D = real(0.5) * (l * l - i1) * l - J
             if step <= tolerance * l:
                 break
-        D = denominator(real(0.5) * (l * l - i1) * l - J, i1)
+        D = denominator(D, i1)
         V = F * wp.transpose(rotation(F, b, i1, l, D))
         return real(0.5) * (V + wp.transpose(V)) - one
 
@@ -205,7 +260,7 @@ def eigen(real: type) -> wp.Function:
     @wp.func(name=f"jacobi_angle_{real.__name__}")
     def angle(app: real, aqq: real, apq: real):
         """(cos, sin) of the rotation that annihilates apq."""
-        if apq == real(0.0):
+        if apq * apq == real(0.0):  # also where the square underflows: h would be 0
             return real(1.0), real(0.0)
         d = aqq - app
         h = wp.sqrt(d * d + real(4.0) * apq * apq)

@@ -30,6 +30,11 @@ class AbstractMaterial(abc.ABC):
         """Names of the physical parameters, SI."""
 
     @property
+    @abc.abstractmethod
+    def example(self) -> dict[str, float]:
+        """Parameters of an everyday sample: where one may start, and what the tests check the laws on."""
+
+    @property
     def memory_rows(self) -> int:
         """Internal variables per particle."""
         return 0

@@ -27,6 +27,10 @@ class NeoHookean(base.AbstractMaterial):
     def parameters(self) -> tuple[str, ...]:
         return ("youngs_modulus", "poissons_ratio")
 
+    @property
+    def example(self) -> dict[str, float]:
+        return {"youngs_modulus": 1e5, "poissons_ratio": 0.4}  # soft rubber
+
     def check_parameters(self, values: base.Values) -> None:
         base.check_names(values, self.parameters)
         base.check_elastic(values)

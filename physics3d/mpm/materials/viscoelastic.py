@@ -60,6 +60,13 @@ class Viscoelastic(base.AbstractMaterial):
         return names + tuple(name + suffix for suffix in self._suffixes for name in _BRANCH)
 
     @property
+    def example(self) -> dict[str, float]:
+        found = {"youngs_modulus": 1e5, "poissons_ratio": 0.3} if self.elastic else {}  # soft tissue
+        for i, suffix in enumerate(self._suffixes):
+            found |= dict(zip((name + suffix for name in _BRANCH), (4e4, 8e4, 0.2 / 4**i, 0.5 / 4**i), strict=True))
+        return found
+
+    @property
     def _suffixes(self) -> tuple[str, ...]:
         return ("", "_2", "_3")[: self.branches]
 
@@ -148,22 +155,15 @@ def _hencky(real: type) -> wp.Function:
 def _neo_hookean(real: type) -> wp.Function:
     """As `_hencky`. b~ = I + B, b~^-1 = I + W; W/(1 + s) is W relaxed before it is scaled to determinant one."""
     mat33 = spectral.matrix_type(real)
-    volume_change, expm1 = spectral.volume_change(real), spectral.expm1(real)
-    log1p = spectral.log1p_extended(real, 1e-10)
-
-    @wp.func(name=f"unimodular_inverse_{real.__name__}")
-    def unimodular_inverse(X: mat33):
-        """det(A)^(1/3) A^-1 - I of A = I + X."""
-        one = wp.identity(n=3, dtype=real)
-        c = expm1(log1p(volume_change(X)) / real(3.0))
-        return c * one - (real(1.0) + c) * (X * wp.inverse(one + X))
+    log_det, expm1 = spectral.log_det(real), spectral.expm1(real)
+    unimodular_inverse = spectral.unimodular_inverse(real)
 
     @wp.func(name=f"maxwell_neo_hookean_{real.__name__}")
     def maxwell(X: mat33, mu: real, K: real, d: real, v: real):
         one = wp.identity(n=3, dtype=real)
-        log_J = real(0.5) * log1p(volume_change(X))
+        log_J = real(0.5) * log_det(X)
         W = unimodular_inverse(X)
-        m = real(1.0) + wp.trace(unimodular_inverse(W)) / real(3.0)
+        m = wp.max(real(1.0) + wp.trace(unimodular_inverse(W)) / real(3.0), real(1.0))
         half = unimodular_inverse(W / (real(1.0) + expm1(wp.min(real(0.5) * m * d, real(60.0))) / m))
         full = unimodular_inverse(W / (real(1.0) + expm1(wp.min(m * d, real(60.0))) / m))
         tau = mu * (half - wp.trace(half) / real(3.0) * one) + K * wp.exp(-real(0.5) * v) * log_J * one
