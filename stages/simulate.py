@@ -1,13 +1,15 @@
 """Particles and their material -> trajectory."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import torch
 
 from physics3d.filling import Body
 from physics3d.log import Log
 from physics3d.mpm.boundaries.base import AbstractBoundary
+from physics3d.mpm.boundaries.impulse import Impulse
 from physics3d.mpm.rollout import Trajectory, rollout
 from physics3d.mpm.world import Estimate, World
 
@@ -20,6 +22,7 @@ class Simulate:
     frames: int  # with frame 0, the initial state
     fps: float  # [1/s]
     excitation: tuple[AbstractBoundary, ...] = ()
+    force: Mapping[str, float] | None = None  # x, y, z: takes the place of the force of every Impulse above [N]
     device: str = "cpu"
 
     def __call__(self, body: Body, estimate: Estimate, *, log: Log) -> Trajectory:
@@ -33,7 +36,7 @@ class Simulate:
                 body.position,
                 body.volume,
                 velocity=estimate.velocity,
-                excitation=tuple(self.excitation),
+                excitation=excited(self.excitation, self.force),
                 frames=self.frames,
                 frame_dt=1 / self.fps,
                 device=self.device,
@@ -53,6 +56,17 @@ class Simulate:
         _report(trajectory, log)
         log.image("motion", _plot(trajectory))
         return trajectory
+
+
+def excited(
+    excitation: tuple[AbstractBoundary, ...], force: Mapping[str, float] | None
+) -> tuple[AbstractBoundary, ...]:
+    """The excitation with every impulse given `force` [N], and without impulses of no force."""
+    if force is None:
+        return tuple(excitation)
+    vector = (float(force["x"]), float(force["y"]), float(force["z"]))
+    pushed = tuple(replace(b, force=vector) if isinstance(b, Impulse) else b for b in excitation)
+    return tuple(b for b in pushed if any(vector) or not isinstance(b, Impulse))
 
 
 def _on_cpu(trajectory: Trajectory) -> Trajectory:
