@@ -2,10 +2,10 @@
 
     loss = (1 - s) |image - photograph|_1 + s (1 - SSIM) + 0.01 mean opacity,   s = `ssim_weight`
 
-    loss = (1 - s) |image - photograph|_1 + s (1 - SSIM) + 0.01 mean opacity,   s = `ssim_weight`
-pixels they draw: e_i = sum over pixels of (blending weight x absolute error), which is what `contribution` returns for
-an error image. Transparent Gaussians are removed, the count grows to a cap, and the early part runs at half resolution.
-Photographs with a matte are composited on random colours, so that empty space becomes transparent.
+Kerbl et al. (2023) split Gaussians by the gradient of their position; here, as in Rota Bulo et al. (2024), by the error
+of the pixels they draw: e_i = sum over pixels of (blending weight x absolute error), which is what `contribution`
+returns for an error image. Transparent Gaussians are removed, the count grows to a cap, and the early part runs at half
+resolution. Photographs with a matte are composited on random colours, so that empty space becomes transparent.
 """
 
 import math
@@ -207,7 +207,7 @@ def fit(
 
 
 def _adam(model: Gaussians, moments: dict, rates: Rates, extent: float, step: int, iterations: int) -> Gaussians:
-    """One step of Adam (0.9, 0.999) on every field; `moments` is kept beside the fields so that it can follow splits."""
+    """One step of Adam (0.9, 0.999) on every field; `moments` are kept beside the fields so that they follow splits."""
     fall = rates.final ** (step / iterations)
     new = {}
     with torch.no_grad():
