@@ -47,7 +47,7 @@ view: ## the newest video and previews of SCENE's last run
 	if [ -n "$$DISPLAY$$WAYLAND_DISPLAY" ] && command -v xdg-open >/dev/null; then xdg-open "$$(ls "$$newest"*.mp4 | head -1)"; fi
 
 test: $(ready) ## everything that needs no GPU and no weights
-	@OMP_NUM_THREADS=1 $(py) -m pytest -n 2 $(ARGS)
+	@OMP_NUM_THREADS=1 $(py) -m pytest -n 2 --dist loadfile $(ARGS)
 
 bench: $(ready) $(addprefix bench-,$(basename $(notdir $(wildcard benchmarks/*.py)))) ## all benchmarks; one alone: make bench-<name>
 

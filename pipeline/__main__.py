@@ -1,8 +1,8 @@
 """Command line: python -m pipeline scene=carnation profile=smoke learn.steps=50
 
-Composes the configuration, says "up to date" if everything has been filed, else runs the flow under Prefect, records it in
-MLflow, and prints what came out. Nothing heavy is imported before it is needed. Exit codes: 0 done, 1 a stage failed,
-2 the command line is wrong, 130 Ctrl-C.
+Composes the configuration, says "up to date" if everything has been filed, else runs the flow under Prefect, records
+it in MLflow, and prints what came out. Nothing heavy is imported before it is needed. Exit codes: 0 done, 1 a stage
+failed, 2 the command line is wrong, 130 Ctrl-C.
 """
 
 import logging

@@ -3,12 +3,12 @@
     fingerprint = sha256( configuration,  code it reaches,  fingerprints of its inputs,  content of the files it names )
 
 - Configuration: without `device`, which must not change the result beyond round-off, and without where the data lies.
-- Code: the syntax trees (no comments, no docstrings, no line numbers) of the modules named by `_target_` anywhere in the
-  configuration, and of every module of this project that they import, at any depth, also from inside functions.
+- Code: the syntax trees (no comments, no docstrings, no line numbers) of the modules named by `_target_` anywhere in
+  the configuration, and of every module of this project that they import, at any depth, also from inside functions.
   `physics3d.log` is left out: it decides how progress looks.
-- Files: an entry `path` (or `..._path`) of the configuration is replaced by the names and sha256 of all files under it that
-  are not hidden, which is what `AbstractSource.files()` lists and at most a little more; the source itself could only be
-  asked by importing torch. Digests are remembered by size and modification time, so that the second look is fast.
+- Files: an entry `path` (or `..._path`) of the configuration is replaced by the names and sha256 of all files under it
+  that are not hidden, which is what `AbstractSource.files()` lists and at most a little more; the source itself could
+  only be asked by importing torch. Digests are remembered by size and modification time: the second look is fast.
 """
 
 import ast

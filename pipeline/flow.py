@@ -63,14 +63,14 @@ def plan(config: dict[str, Any], capture: Step) -> Plan:
 def left_out(config: dict[str, Any], capture: dict[str, Any]) -> dict[str, str]:
     """Stage -> why this scene, or this method, does without it. `capture` is the stored Capture, see `peek`."""
     why = {name: f"the configuration says {name}=null" for name in STAGES if config.get(name) is None}
-    takes = {take["role"]: take for take in reversed(capture["takes"])}
+    roles = {take["role"] for take in capture["takes"]}
     if capture["gaussians"] is not None:
         why["reconstruct"] = "the scene is a trained model already"
     if capture["single_object"]:
         why["segment"] = "the scene is a single object"
-    if "learn" not in takes:
+    if "learn" not in roles:
         why.setdefault("learn", "the scene has no recorded motion to learn from")
-    if "evaluate" not in takes and not takes.get("learn", {}).get("held_out_cameras"):
+    if not roles:
         why["evaluate"] = "the scene has no recorded motion to compare with"
     return why
 

@@ -1,5 +1,7 @@
-"""What a person sees at the end of a run: steps, learned parameters, scores, and where to look. Read from artifacts only."""
+"""What a person sees at the end of a run: steps, learned parameters, scores, and where to look; read from artifacts."""
 
+import math
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,7 @@ def report(plan: Plan, hits: dict[str, bool]) -> dict[str, float]:
     from rich.console import Console
     from rich.table import Table
 
-    console = Console(highlight=False, soft_wrap=True)
+    console = Console(highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() else 160)
     steps = {step.name: step for step in plan.steps}
 
     def table(*columns: str) -> Table:
@@ -55,7 +57,7 @@ def report(plan: Plan, hits: dict[str, bool]) -> dict[str, float]:
         scores = table("score", *metrics)
         for name, row in stored["values"].items():
             scores.add_row(name, *("-" if row.get(m) is None else f"{row[m]:.4g}" for m in metrics))
-            headline |= {f"score/{name}/{m}": v for m, v in row.items() if v is not None}
+            headline |= {f"score/{name}/{m}": v for m, v in row.items() if v is not None and math.isfinite(v)}
         console.print(scores)
         for name, note in stored["notes"].items():
             console.print(f"{name}: {note}", markup=False)

@@ -1,8 +1,9 @@
 """The Prefect server of one run. A flow needs one; it lives exactly as long as the process that started it.
 
-Prefect would start one by itself, but that one dies before the flow when Ctrl-C reaches the whole terminal, and outlives it
-after `kill -9`. Ours runs in a session of its own under a shell that waits for the end of a pipe we hold: however this
-process ends, the pipe closes and the shell stops the server. Set PREFECT_API_URL to use a server of your own.
+Prefect would start one by itself, but that one dies before the flow when Ctrl-C reaches the whole terminal, and
+outlives it after `kill -9`. Ours runs in a session of its own under a shell that waits for the end of a pipe
+we hold: however this process ends, the pipe closes and the shell stops the server. Set PREFECT_API_URL to use a server
+of your own.
 """
 
 import fcntl

@@ -3,7 +3,7 @@
 import difflib
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from pipeline.fingerprint import ROOT
 
@@ -34,7 +34,7 @@ def compose(words: list[str]) -> tuple[dict[str, Any], dict[str, str]]:
     with initialize_config_dir(str(CONF), version_base="1.3"):
         groups = [w for w in words if w.split("=")[0] in GROUPS]
         base = compose("config", groups)
-        known = OmegaConf.to_container(base, resolve=False)
+        known = cast(dict[str, Any], OmegaConf.to_container(base, resolve=False))
         values = [w for w in words if w not in groups]
         for word in values:
             _check_value(word, known)
@@ -43,7 +43,7 @@ def compose(words: list[str]) -> tuple[dict[str, Any], dict[str, str]]:
             picked = {g: config.hydra.runtime.choices[g] for g in GROUPS if g in config.hydra.runtime.choices}
             OmegaConf.set_struct(config, False)
             del config["hydra"]
-            return OmegaConf.to_container(config, resolve=True), picked
+            return cast(dict[str, Any], OmegaConf.to_container(config, resolve=True)), picked
         except (HydraException, OmegaConfBaseException) as error:
             raise SettingsError(str(error).strip().splitlines()[0]) from error
 

@@ -1,9 +1,10 @@
 """A step of the pipeline: one stage with its configuration and its inputs, reused by fingerprint or computed and filed.
 
-The result is a folder artifacts/<stage>/<fingerprint>/ with the artifact, what the stage logged, and manifest.json (size and
-sha256 of every file, configuration, time, memory, versions). It is written under a hidden name beside its place, flushed to the
-disk and renamed: whatever kills the run, nothing half-done looks finished. A lock per artifact (released by the system
-when its holder dies) makes a second run wait and then reuse; whoever holds the lock sweeps what dead runs left behind.
+The result is a folder artifacts/<stage>/<fingerprint>/ with the artifact, what the stage logged, and manifest.json
+(size and sha256 of every file, configuration, time, memory, versions). It is written under a hidden name beside its
+place, flushed to the disk and renamed: whatever kills the run, nothing half-done looks finished. A lock per artifact
+(released by the system when its holder dies) makes a second run wait and then reuse; whoever holds the lock sweeps what
+dead runs left behind.
 """
 
 import difflib
@@ -130,8 +131,10 @@ def load(source: Any, device: str, verify: bool = False) -> Any:
 
 
 def peek(folder: Path, arrays: bool = False) -> Any:
-    """What `AbstractArtifact.save` wrote, as plain dicts and lists, without importing torch; tensors as numpy arrays, or None
-    unless `arrays`."""
+    """What `AbstractArtifact.save` wrote, as plain dicts and lists, without importing torch.
+
+    Tensors become numpy arrays, or None unless `arrays`.
+    """
     stored: dict[str, Any] = {}
     if arrays:
         from safetensors.numpy import load_file
@@ -154,8 +157,10 @@ def peek(folder: Path, arrays: bool = False) -> Any:
 
 
 def build(config: Any, device: str, where: str = "") -> Any:
-    """Configuration -> objects: every mapping with `_target_` becomes that class, lists become tuples, `device: auto` becomes
-    `device`. Raises ValueError naming the entry, with the close match if a name is misspelt."""
+    """Configuration -> objects: a mapping with `_target_` becomes that class, a list a tuple, `device: auto` `device`.
+
+    Raises ValueError naming the entry, with the close match if a name is misspelt.
+    """
     if isinstance(config, list | tuple):
         return tuple(build(v, device, f"{where}.{i}") for i, v in enumerate(config))
     if not isinstance(config, dict):
@@ -177,7 +182,10 @@ def build(config: Any, device: str, where: str = "") -> Any:
             hint = f"did you mean {close[0]}?" if close else f"it has {', '.join(known)}"
             raise ValueError(f"{where}.{key}: {name} has no such field; {hint}")
     try:
-        return kind(**values)
+        made = kind(**values)
+        if hasattr(made, "check"):
+            made.check()
+        return made
     except (TypeError, ValueError) as error:
         raise ValueError(f"{where}: {error}") from error
 
@@ -248,15 +256,18 @@ def _keep(step: Step, temporary: Path) -> Path | None:
         kept.parent.mkdir(parents=True, exist_ok=True)
         kept.write_text(text)
     except OSError:
-        kept = None
-    shutil.rmtree(temporary, ignore_errors=True)
+        return None
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
     return kept
 
 
 @contextmanager
 def _lock(step: Step, wait: bool) -> Iterator[bool]:
-    """Hold the right to write this step's artifact; the system takes it back from a dead process. False if not `wait` and
-    another process holds it."""
+    """Hold the right to write this step's artifact; the system takes it back from a dead process.
+
+    Yields False if not `wait` and another process holds it.
+    """
     path = step.shelf / ".locks" / f"{step.stage}-{step.fingerprint}"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,8 +1,8 @@
 """MLflow: one run per flow, one nested run per stage, replayed from what the stage left in its artifact.
 
-A stage that was reused is replayed too (tag cache=hit), so that every run shows all curves and previews. Headline numbers
-stand on the parent, because parents are what people compare. Tracking may fail, results may not: any error here is one
-warning, and the run goes on without.
+A stage that was reused is replayed too (tag cache=hit), so that every run shows all curves and previews. Headline
+numbers stand on the parent, because parents are what people compare. Tracking may fail, results may not: any error here
+is one warning, and the run goes on without.
 
     python -m pipeline.tracking <output folder>        prints the address that compares runs, and serves it
 """

@@ -1,4 +1,4 @@
-"""Throw-away stages for the tests of the machinery: small artifacts, and switches to be slow, to fail, or to fill the disk."""
+"""Throw-away stages to test the machinery with; switches make them slow, fail, or fill the disk."""
 
 import time
 from dataclasses import dataclass, field
@@ -9,6 +9,8 @@ import torch
 from physics3d.gaussians.cameras import Camera
 from physics3d.gaussians.model import Gaussians
 from physics3d.log import Log
+from physics3d.metrics.scores import Scores
+from physics3d.mpm.world import Estimate
 from physics3d.scenes.base import Capture, Take
 from physics3d.video import Video
 
@@ -67,6 +69,37 @@ class Photograph:
             gaussians=blob() if self.trained else None,
             single_object=self.single_object,
             truth={"youngs_modulus": 2.0},
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Material:
+    """An estimate, whatever the inputs."""
+
+    modulus: float
+    seconds: float = 0.0
+    error: str = ""
+
+    def __call__(self, *inputs: object, log: Log) -> Estimate:
+        log.info("estimating")
+        log.metric("loss", 1.0, 0)
+        time.sleep(self.seconds)
+        if self.error:
+            raise ValueError(self.error)
+        return Estimate(parameters={"youngs_modulus": torch.tensor(self.modulus)}, velocity=torch.zeros(3))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Compare:
+    """Scores the first pixel of the videos."""
+
+    def __call__(
+        self, capture: Capture, videos: dict[str, Video], estimates: dict[str, Estimate], *, log: Log
+    ) -> Scores:
+        assert videos.keys() == estimates.keys()
+        return Scores(
+            values={k: {"psnr": float(v.frames[0][0, 0, 0, 0]), "vmaf": None} for k, v in videos.items()},
+            notes={"vmaf": "too small"},
         )
 
 

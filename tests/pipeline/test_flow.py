@@ -1,0 +1,204 @@
+"""The graph, and whole runs of it under Prefect and MLflow, on throw-away stages."""
+
+import json
+import os
+import shutil
+import signal
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from pipeline.flow import STAGES, first, plan
+from pipeline.server import server
+from pipeline.stage import run
+from pipeline.tracking import EXPERIMENT, address, database, flatten
+
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parent.parent
+RUN = """
+import json, sys, time
+from pipeline import __main__ as command
+config = json.loads(sys.argv[1])
+command.compose = lambda words: (config, dict.fromkeys(command.GROUPS, "toy"))
+code = command.main([])
+if sys.argv[2:] == ["light"]:
+    print("imported:", [m for m in ("torch", "warp", "prefect", "mlflow") if m in sys.modules])
+sys.exit(code)
+"""
+
+
+def configuration(folder: Path, **changes: dict) -> dict:
+    """A whole experiment of throw-away stages; `changes` are entries of the stages' configurations."""
+    config: dict = {name: {"_target_": "toy.Add", "amount": 1, "name": name} for name in STAGES}
+    for name in STAGES:
+        config[name]["diary"] = str(folder / "diary")
+    config["capture"] = {"_target_": "toy.Photograph", "roles": ["learn", "evaluate"]}
+    config["guess"] = {"_target_": "toy.Material", "modulus": 1.0}
+    config["learn"] = {"_target_": "toy.Material", "modulus": 1.5}
+    config["evaluate"] = {"_target_": "toy.Compare"}
+    for name, change in changes.items():
+        config[name] = None if change is None else config[name] | change
+    rest = {"output": str(folder), "device": "cpu", "verify": False, "scene": {"name": "toy"}, "seed": 0}
+    return config | rest
+
+
+ALL = "capture guess reconstruct segment fill learn simulate render simulate_initial render_initial evaluate".split()
+
+
+@pytest.mark.parametrize(
+    "changes, missing, steps",
+    [
+        ({}, {}, ALL),
+        ({"capture": {"trained": True}}, {"reconstruct": "trained model"}, [s for s in ALL if s != "reconstruct"]),
+        ({"capture": {"single_object": True}}, {"segment": "single object"}, [s for s in ALL if s != "segment"]),
+        (
+            {"capture": {"roles": []}},
+            {"learn": "no recorded motion", "evaluate": "no recorded motion"},
+            "capture guess reconstruct segment fill simulate render".split(),
+        ),
+        (
+            {"learn": None},
+            {"learn": "learn=null"},
+            "capture guess reconstruct segment fill simulate render evaluate".split(),
+        ),
+        ({"capture": {"roles": ["learn"]}}, {}, ALL),
+    ],
+    ids=["everything", "trained model", "single object", "no recording", "method without learning", "learn only"],
+)
+def test_a_scene_leaves_out_what_it_does_not_need_and_says_why(tmp_path, changes, missing, steps):
+    config = configuration(tmp_path, **changes)
+    capture = first(config, tmp_path / "artifacts")
+    run(capture, "cpu")
+    whole = plan(config, capture)
+    assert [s.name for s in whole.steps] == steps
+    assert whole.left_out.keys() == missing.keys()
+    assert all(missing[name] in why for name, why in whole.left_out.items())
+
+
+def test_initial_material_is_simulated_without_what_was_learned(tmp_path):
+    config = configuration(tmp_path)
+    capture = first(config, tmp_path / "artifacts")
+    run(capture, "cpu")
+    names = {step.name: step for step in plan(config, capture).steps}
+    other = {step.name: step for step in plan(configuration(tmp_path, learn={"modulus": 3.0}), capture).steps}
+    changed = {name for name in names if names[name].fingerprint != other[name].fingerprint}
+    assert changed == {"learn", "simulate", "render", "evaluate"}
+
+
+@pytest.fixture(scope="module")
+def prefect(tmp_path_factory) -> Iterator[dict[str, str]]:
+    """One Prefect server for all runs of this file: what runs need in their environment."""
+    before = dict(os.environ)
+    with server(tmp_path_factory.mktemp("prefect"), meanwhile=lambda: None):
+        yield {**os.environ, "PYTHONPATH": f"{ROOT}:{HERE}", "OMP_NUM_THREADS": "1"}
+    os.environ.clear()
+    os.environ.update(before)
+
+
+@pytest.fixture(scope="module")
+def empty_record(tmp_path_factory) -> Path:
+    """An MLflow database with nothing in it: copying it is quicker than having each run make its own."""
+    from mlflow.tracking import MlflowClient
+
+    folder = tmp_path_factory.mktemp("mlflow")
+    MlflowClient(database(folder)).search_experiments()
+    return folder / "mlflow.db"
+
+
+@pytest.fixture
+def folder(tmp_path, empty_record) -> Path:
+    shutil.copy(empty_record, tmp_path)
+    return tmp_path
+
+
+def start(config: dict, env: dict[str, str], *words: str) -> subprocess.Popen:
+    call = [sys.executable, "-c", RUN, json.dumps(config), *words]
+    pipe = subprocess.PIPE
+    return subprocess.Popen(call, stdout=pipe, stderr=pipe, text=True, env=env, cwd=ROOT, start_new_session=True)
+
+
+def test_a_run_its_record_and_the_run_after_it(tmp_path, prefect):
+    config = configuration(tmp_path)
+    process = start(config, prefect)
+    out, err = process.communicate()
+    assert process.returncode == 0, out + err
+    assert "computed" in out and "reused" not in out and address(tmp_path) in out
+    table = [line.split() for line in out.splitlines()]
+    assert ["youngs_modulus", "1", "1.5", "2"] in table  # start, learned, truth
+    assert ["learned", "11", "-"] in table, out  # every stage added its 1 to what it was given
+
+    with sqlite3.connect(tmp_path / "mlflow.db") as record:
+        runs = dict(record.execute("select run_uuid, status from runs").fetchall())
+        assert set(runs.values()) == {"FINISHED"} and len(runs) == 1 + len(ALL)
+        tags = set(record.execute("select key, value from tags where key in ('stage', 'cache', 'scene')").fetchall())
+        assert {("stage", "learn"), ("cache", "miss"), ("scene", "toy")} <= tags
+        parent = {key for (key,) in record.execute("select key from latest_metrics")}
+        assert {"time/learn_s", "score/learned/psnr", "learned/youngs_modulus", "loss", "curve"} <= parent
+        params = dict(record.execute("select key, value from params").fetchall())
+        assert params["learn.modulus"] == "1.5"
+        (experiment,) = record.execute(
+            "select artifact_location from experiments where name=?", (EXPERIMENT,)
+        ).fetchone()
+        assert experiment == (tmp_path / "mlartifacts").as_uri()
+    assert list((tmp_path / "mlartifacts").rglob("*.png")), "previews belong to the record"
+
+    again, _ = start(config, prefect, "light").communicate()
+    assert (
+        "up to date: all 11 steps" in again
+        and again.count("reused") == 11
+        and "computed" not in again.split("up to")[0]
+    )
+    assert "imported: []" in again  # that is what makes it quick
+
+    more, _ = start(configuration(tmp_path, learn={"modulus": 1.7}), prefect).communicate()
+    assert more.count("computed") == 4 and more.count("reused") == 7  # learn, simulate, render, evaluate
+
+
+def test_a_failing_stage_is_one_line_and_the_next_run_goes_on(folder, prefect):
+    process = start(configuration(folder, learn={"error": "no motion\nin sight"}), prefect)
+    out, err = process.communicate()
+    assert process.returncode == 1
+    (line,) = err.strip().splitlines()
+    assert line.startswith("error: learn: no motion in sight (traceback: ")
+    with sqlite3.connect(folder / "mlflow.db") as record:
+        assert ("FAILED",) in record.execute("select status from runs").fetchall()
+    out, _ = start(configuration(folder), prefect).communicate()
+    assert out.count("reused") == 5 and out.count("computed") == 6
+
+
+def test_bad_value_is_found_before_anything_runs(folder, prefect):
+    config = configuration(folder, evaluate={"tolerance": 3})
+    process = start(config, prefect)
+    _, err = process.communicate()
+    assert process.returncode == 1 and "error: evaluate.tolerance: Compare has no such field" in err
+    assert not (folder / "artifacts" / "capture").exists()
+
+
+def test_interrupt_ends_with_130_and_keeps_what_is_finished(folder, prefect):
+    process = start(configuration(folder, learn={"seconds": 60}), prefect)
+    assert process.stdout is not None
+    while "estimating" not in (line := process.stdout.readline()) or "learn" not in line:
+        assert line, process.communicate()
+    os.killpg(process.pid, signal.SIGINT)  # as the terminal does
+    _, err = process.communicate()
+    assert process.returncode == 130 and "interrupted; finished stages are kept" in err
+    assert "Traceback" not in err
+    assert [p.name for p in (folder / "artifacts" / "learn").iterdir()] == []
+    assert len(list((folder / "artifacts" / "fill").iterdir())) == 1
+
+
+def test_a_broken_record_does_not_lose_the_result(tmp_path, prefect):
+    (tmp_path / "mlflow.db").write_text("this is no database")
+    process = start(configuration(tmp_path), prefect)
+    out, err = process.communicate()
+    assert process.returncode == 0, err
+    assert out.count("not recorded in MLflow, the results are unharmed") == 1
+    assert out.count("computed") == 11
+
+
+def test_flatten():
+    assert flatten({"a": {"b": [1, {"c": 2}]}, "d": None, "e": []}) == {"a.b.0": 1, "a.b.1.c": 2, "d": None, "e": []}
