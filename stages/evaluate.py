@@ -2,7 +2,8 @@
 material."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -13,19 +14,22 @@ from physics3d.metrics.image import ms_ssim, psnr, ssim
 from physics3d.metrics.motion import flow, flow_error, motion_psnr, moving, oscillation, signal
 from physics3d.metrics.scores import Scores
 from physics3d.metrics.video import vmaf
+from physics3d.mpm.boundaries.base import AbstractBoundary
 from physics3d.mpm.world import Estimate
 from physics3d.scenes.base import Capture, Take
 from physics3d.video import Video, contact_sheet, space_time_slice, write_mp4
+from stages.simulate import excited
 
 FROZEN, REFERENCE = "frozen first frame", "reference"
+DIFFERENT = "the simulated excitation is not the one that was filmed: only the eye may compare"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluate:
     """Scores videos against the take with role "evaluate", or against the held-out cameras of the one learned from."""
 
-    comparable: bool = True  # False where the simulated excitation is not the take's: then only the eye may compare
-    note: str = ""  # why not
+    excitation: tuple[AbstractBoundary, ...] | None = None  # what was simulated; None: what the take was excited by
+    force: Mapping[str, float] | None = None  # of its impulses, as in Simulate [N]
 
     def __call__(
         self, capture: Capture, videos: dict[str, Video], estimates: dict[str, Estimate], *, log: Log
@@ -40,9 +44,8 @@ class Evaluate:
                 f"capture {capture.name} has {len(capture.takes)} takes and {len(videos)} videos; nothing to evaluate"
             )
         cameras = take.held_out_cameras or tuple(range(len(take.cameras)))
-        notes = (
-            {} if self.comparable else {"comparison": self.note or "the simulated excitation is not the reference's"}
-        )
+        comparable = self.excitation is None or same(excited(self.excitation, self.force), take.excitation)
+        notes = {} if comparable else {"comparison": DIFFERENT}
         if capture.take("evaluate") is None and not take.held_out_cameras:
             notes["reference"] = "no take and no camera is held out: these are the frames that were learned from"
         clips = {name: matched(name, video, take, cameras) for name, video in videos.items()}
@@ -53,13 +56,13 @@ class Evaluate:
         rows = {REFERENCE: references, FROZEN: [r[:1].expand_as(r).contiguous() for r in references], **clips}
         log.info(
             f"{count} frames, {len(cameras)} camera(s), {size[1]} x {size[0]} px, against take {take.name}"
-            + ("" if self.comparable else " (not comparable)")
+            + ("" if comparable else " (not comparable)")
         )
         values = self.measure(rows, take.fps, notes, log)
         parameters = parameter_errors(estimates, capture.truth)
         if capture.truth_source and parameters:
             notes["truth"] = capture.truth_source
-        scores = Scores(values=values, parameters=parameters, notes=notes, comparable=self.comparable)
+        scores = Scores(values=values, parameters=parameters, notes=notes, comparable=comparable)
         scores.check()
         for table in (scores.values, scores.parameters):
             for row, cells in table.items():
@@ -111,6 +114,14 @@ class Evaluate:
                 for reason in {cells[name][1] for cells in per_camera} - {""}:
                     notes.setdefault(name, reason)
         return table
+
+
+def same(simulated: tuple[AbstractBoundary, ...], filmed: tuple[AbstractBoundary, ...]) -> bool:
+    """Whether both were set in motion alike, to a thousandth of every number."""
+    if [type(b) for b in simulated] != [type(b) for b in filmed]:
+        return False
+    pairs = [(getattr(a, f.name), getattr(b, f.name)) for a, b in zip(simulated, filmed) for f in fields(a)]
+    return all(a == b if isinstance(a, str) else np.allclose(a, b, rtol=1e-3) for a, b in pairs)
 
 
 def matched(name: str, video: Video, take: Take, cameras: tuple[int, ...]) -> list[Tensor]:
