@@ -6,7 +6,7 @@ A reconstruction puts Gaussians on the visible surface only; a simulated body ne
     normals    least axis of the local covariance; outward is the side from which more of the sky is seen
     thin       both sides see the sky alike (a petal, a leaf); such samples bound no volume
     inside     of the closed surface through the remaining samples (`Poisson`), or by `WindingNumber`
-    particles  one per lattice cell of that volume, at the centroid of the part inside, V_p = measure of that part [m^3];
+    particles  one per lattice cell of that volume, at the centroid of the part inside, V_p = its measure [m^3];
                plus one per spacing^2 of thin surface that no cell covers, V_p = area * thickness
 
 so that sum V_p is the volume of the body. Cells of less than a quarter give their volume to the nearest particle.
@@ -86,7 +86,7 @@ class AbstractSolid:
 
 @dataclass(frozen=True, kw_only=True)
 class Poisson(AbstractSolid):
-    """Screened Poisson surface of the samples that bound a volume, ray-casting parity for the test. Closes missing caps."""
+    """Inside the screened Poisson surface of the samples that bound a volume. Closes missing caps."""
 
     enclosure: float = 0.4  # least share of directions in which a point inside must meet the surface
 
@@ -288,7 +288,7 @@ def fill(
 
 
 def without_floaters(point: np.ndarray) -> np.ndarray:
-    """Indices of the points that are not statistical outliers: mean distance to 20 neighbours below mean + 3 deviations."""
+    """Indices of points whose mean distance to 20 neighbours is below its mean + 3 deviations over all points."""
     o3d = open3d()
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(point))
     _, kept = cloud.remove_statistical_outlier(nb_neighbors=min(20, len(point) - 1), std_ratio=3.0)
@@ -396,7 +396,7 @@ def sheet(point: np.ndarray, normal: np.ndarray, spacing: float) -> tuple[np.nda
 
 
 def sample_area(point: np.ndarray, normal: np.ndarray, spacing: float, tree: cKDTree) -> np.ndarray:
-    """Area [m] [m^2] of each sample: a third of the triangles around it, in the Delaunay triangulation of its neighbours."""
+    """Area [m^2] of each sample: a third of the Delaunay triangles around it, among neighbours in its layer."""
     area = np.zeros(len(point))
     _, neighbours = tree.query(point, k=min(20, len(point)), distance_upper_bound=1.5 * spacing)
     tangent = np.linalg.svd(normal[:, None, :])[2][:, 1:, :]

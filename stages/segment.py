@@ -1,0 +1,242 @@
+"""Photographs + Gaussians + what a person pointed at -> which Gaussians may move."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from physics3d.gaussians.model import Gaussians
+from physics3d.gaussians.rasterize import rasterize
+from physics3d.gaussians.render import render
+from physics3d.log import Log
+from physics3d.scenes.base import Capture
+from physics3d.segmentation import Segmentation
+from physics3d.segmentation.lift import contributions, islands, lift, touching
+from physics3d.segmentation.masks import AbstractMasker, GrabCut
+from physics3d.segmentation.previews import contact_sheet, tinted
+from physics3d.segmentation.prompts import Prompt, View, carry_masks, mask_of_box, prompted_mask, refined_mask
+
+LEAST_PIXELS = 20  # a mask smaller than this is no mask
+
+
+@dataclass(frozen=True, kw_only=True)
+class Segment:
+    """Mattes of the capture where it has them and no prompt says more; else prompts, carried to other views."""
+
+    prompts: tuple[Prompt, ...] = ()
+    masker: AbstractMasker = field(default_factory=GrabCut)
+    views: int = 16  # photographs that are masked, spread around the object
+    size: int = 480  # longer side of the photographs as they are masked [px]
+    device: str = "cpu"
+
+    def __call__(self, capture: Capture, gaussians: Gaussians, *, log: Log) -> Segmentation:
+        """Raises ValueError naming view and prompt if a prompt is outside the image or finds nothing."""
+        for prompt in self.prompts:
+            prompt.check()
+        parts = tuple(dict.fromkeys(p.part for p in self.prompts)) or ("body",)
+        gaussians = gaussians.to(self.device)
+
+        if capture.images:
+            every, views, maps = self._maps(capture, gaussians, parts, log)
+            label = self._lift(gaussians, views, maps, parts)
+            if self.prompts:
+                views, maps = every, self._refine(gaussians, label, every, parts, capture, log)
+                label = self._lift(gaussians, views, maps, parts)
+            log.image("masks", contact_sheet([tinted(v.image, m.numpy()) for v, m in zip(views, maps)]))
+            gaussians = gaussians.to("cpu")
+        else:
+            views, maps = [], []
+            gaussians = gaussians.to("cpu")
+            label = self._boxes_only(gaussians, parts)
+
+        apart = islands(gaussians.mean, gaussians.opacity, label)
+        label[apart] = 0
+        touch = touching(gaussians.mean, gaussians.opacity, label)
+        for k, part in enumerate(parts, 1):
+            count = int((label == k).sum())
+            log.info(f"{part}: {count} of {len(label)} Gaussians")
+            log.metric(f"gaussians_{part}", count)
+            if count == 0:
+                raise ValueError(
+                    f"no Gaussian belongs to {part!r}; correct segment.prompts, see the previews of segment"
+                )
+        log.info(f"{int(apart.sum())} Gaussians of small islands went back to static")
+        log.info(
+            f"{int(touch.sum())} moving Gaussians lie next to static ones"
+            + ("; the body is attached there" if touch.any() else "; nothing holds the body")
+        )
+        log.metric("islands", int(apart.sum()))
+        log.metric("attached", int(touch.sum()))
+        self._show(capture, gaussians, label, log)
+
+        masks = None
+        if views:
+            height, width = (max(m.shape[k] for m in maps) for k in (0, 1))
+            masks = torch.zeros(len(maps), height, width, dtype=torch.uint8)
+            for target, labelled in zip(masks, maps):
+                target[: labelled.shape[0], : labelled.shape[1]] = labelled.to(torch.uint8)
+        return Segmentation(label=label, parts=parts, masks=masks, mask_views=tuple(v.index for v in views))
+
+    def _maps(
+        self, capture: Capture, gaussians: Gaussians, parts: tuple[str, ...], log: Log
+    ) -> tuple[list[View], list[View], list[torch.Tensor]]:
+        """All views, those that could be masked, and for each of these a map of labels [h, w]."""
+        if not self.prompts and not capture.alphas:
+            raise ValueError(
+                f"segment.prompts is empty and {capture.name} has no mattes; say what moves, e.g. "
+                "prompts=[{view: 0, box: [0.3, 0.2, 0.7, 0.8]}] in fractions of width and height"
+            )
+        firsts = {p.part: _index(capture, p.view) for p in self.prompts if p.in_image}
+        chosen = self._spread(capture, gaussians, tuple(firsts.values()))
+        views = [self._view(capture, gaussians, i) for i in log.progress(chosen, "rendering depth")]
+        by_index = {v.index: v for v in views}
+
+        masks: dict[str, dict[int, np.ndarray]] = {}
+        for part in parts:
+            own = tuple(p for p in self.prompts if p.part == part)
+            in_image = tuple(p for p in own if p.in_image)
+            if in_image:
+                first = by_index[firsts[part]]
+                here = tuple(p for p in in_image if _index(capture, p.view) == first.index)
+                if len(here) < len(in_image):
+                    raise ValueError(
+                        f"the prompts of {part!r} are in several views; give those of one part in one view"
+                    )
+                others = tuple(
+                    p for p in self.prompts if p.part != part and p.in_image and _index(capture, p.view) == first.index
+                )
+                mask = prompted_mask(here, others, first, self.masker)
+                masks[part] = carry_masks(first, mask, views, self.masker, log=log)
+            elif own:
+                found = {v.index: mask_of_box(own[0], v, self.masker) for v in log.progress(views, "masking the box")}
+                masks[part] = {i: m for i, m in found.items() if m is not None}
+            else:
+                masks[part] = {v.index: np.ones(v.image.shape[:2], bool) for v in views}
+            if sum(m.sum() for m in masks[part].values()) < LEAST_PIXELS:
+                names = ", ".join(v.name for v in views[:4])
+                raise ValueError(f"the masks of {part!r} are empty in {names}, ...; correct segment.prompts {own}")
+
+        kept, maps = [], []
+        for view in views:
+            if not all(view.index in masks[part] for part in parts):
+                continue
+            maps.append(_labelled([masks[part][view.index] for part in parts], view, capture))
+            kept.append(view)
+        if not kept or not any(bool(m.any()) for m in maps):
+            raise ValueError(f"no view shows all of {', '.join(parts)}; prompt them in a view that shows them")
+        log.info(f"{len(kept)} of {len(capture.images)} photographs masked")
+        return views, kept, maps
+
+    def _lift(self, gaussians: Gaussians, views: list[View], maps: list[torch.Tensor], parts: tuple[str, ...]):
+        weights = contributions(gaussians, [v.camera for v in views], maps, 1 + len(parts))
+        mean = gaussians.mean.cpu()
+        label = lift(mean, weights)
+        for k, part in enumerate(parts, 1):
+            boxes = [p for p in self.prompts if p.part == part and p.lower is not None]
+            if boxes:
+                allowed = torch.stack([p.within(mean) for p in boxes]).any(0)
+                label[(label == k) & ~allowed] = 0
+        return label
+
+    def _refine(self, gaussians, label, views: list[View], parts: tuple[str, ...], capture: Capture, log: Log):
+        """Maps again, each view now prompted by what all views together say."""
+        maps = []
+        for view in log.progress(views, "refining masks"):
+            masks = []
+            for k in range(1, len(parts) + 1):
+                one = (label == k).to(gaussians.mean)[:, None].expand(-1, 3)
+                with torch.no_grad():
+                    drawn = rasterize(
+                        gaussians.mean,
+                        gaussians.covariance(),
+                        gaussians.opacity,
+                        one,
+                        view.camera,
+                        background=(0, 0, 0),
+                    )
+                masks.append(refined_mask(drawn.color[..., 0].cpu().numpy(), view, self.masker))
+            maps.append(_labelled(masks, view, capture))
+        return maps
+
+    def _spread(self, capture: Capture, gaussians: Gaussians, first: tuple[int, ...]) -> list[int]:
+        """The prompted views, and others spread evenly over the training photographs by farthest direction."""
+        if self.views < 1:
+            raise ValueError(f"segment.views is {self.views}, must be at least 1")
+        candidates = [i for i in range(len(capture.images)) if i not in capture.held_out or i in first]
+        centres = torch.stack([capture.cameras[i].centre for i in candidates])
+        chosen = list(dict.fromkeys(first)) or [candidates[0]]
+        distance = torch.full((len(candidates),), torch.inf, dtype=torch.float64)
+        for i in chosen:
+            distance = torch.minimum(distance, (centres - capture.cameras[i].centre).norm(dim=1))
+        while len(chosen) < min(self.views, len(candidates)):
+            k = int(distance.argmax())
+            chosen.append(candidates[k])
+            distance = torch.minimum(distance, (centres - centres[k]).norm(dim=1))
+            distance[k] = -1
+        return chosen
+
+    def _view(self, capture: Capture, gaussians: Gaussians, index: int) -> View:
+        import cv2
+
+        image, camera = capture.images[index].numpy(), capture.cameras[index]
+        if max(image.shape) > self.size:
+            camera = camera.scaled(self.size / max(image.shape))
+            image = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+        with torch.no_grad():
+            rendered = render(gaussians, camera, background=capture.background)
+        rendered = type(rendered)(color=rendered.color.cpu(), alpha=rendered.alpha.cpu(), depth=rendered.depth.cpu())
+        return View(index, capture.names[index], image, camera, rendered)
+
+    def _boxes_only(self, gaussians: Gaussians, parts: tuple[str, ...]) -> torch.Tensor:
+        """Without photographs a part is what lies in its box in space."""
+        label = torch.zeros(len(gaussians), dtype=torch.int32)
+        for k, part in reversed(list(enumerate(parts, 1))):
+            boxes = [p for p in self.prompts if p.part == part and p.lower is not None]
+            if not boxes:
+                raise ValueError(
+                    f"the capture has no photographs, so {part!r} needs a box in space: give lower and upper [m]"
+                )
+            label[torch.stack([p.within(gaussians.mean) for p in boxes]).any(0)] = k
+        return label
+
+    def _show(self, capture: Capture, gaussians: Gaussians, label: torch.Tensor, log: Log) -> None:
+        """What moves and what stays, cut apart, from up to eight views."""
+        if log.folder is None or not capture.cameras:
+            return
+        which = np.linspace(0, len(capture.cameras) - 1, min(8, len(capture.cameras))).round().astype(int)
+        for name, chosen in (("moving", label > 0), ("static", label == 0)):
+            if not chosen.any():
+                continue
+            pictures = []
+            for i in which:
+                camera = capture.cameras[i]
+                camera = camera.scaled(min(1.0, 320 / max(camera.width, camera.height)))
+                with torch.no_grad():
+                    color = render(gaussians.select(chosen), camera, background=(1.0, 1.0, 1.0)).color
+                pictures.append((color.clamp(0, 1) * 255).round().to(torch.uint8).numpy())
+            log.image(name, contact_sheet(pictures))
+
+
+def _index(capture: Capture, view: str | int) -> int:
+    """Index of a view given by name or number. Raises ValueError listing some names."""
+    if isinstance(view, int) and 0 <= view < len(capture.names):
+        return view
+    if view in capture.names:
+        return capture.names.index(view)
+    raise ValueError(
+        f"prompt: view {view!r} is not in {capture.name}; give an index below {len(capture.names)} or a name such as "
+        + ", ".join(capture.names[:3])
+    )
+
+
+def _labelled(masks: list[np.ndarray], view: View, capture: Capture) -> torch.Tensor:
+    """Map of labels [h, w]; a pixel claimed twice belongs to the part named first, one outside the matte to none."""
+    import cv2
+
+    labelled = np.zeros(view.image.shape[:2], np.int64)
+    for k in range(len(masks), 0, -1):
+        labelled[masks[k - 1]] = k
+    if capture.alphas:
+        size = view.camera.width, view.camera.height
+        labelled[cv2.resize(capture.alphas[view.index].numpy(), size, interpolation=cv2.INTER_AREA) < 128] = 0
+    return torch.from_numpy(labelled)
