@@ -1,4 +1,4 @@
-"""Reconstruction learns a scene that can be told exactly: pictures of known Gaussians, with and without mattes, points."""
+"""Reconstruction learns what can be told exactly: pictures of known Gaussians, with and without mattes and points."""
 
 import json
 import math
