@@ -122,6 +122,9 @@ def show(config: dict[str, Any]) -> None:
 
 def _quiet() -> None:
     """Libraries talk to themselves; the person watching reads our lines."""
+    import warp
+
+    warp.config.quiet = True
     warnings.filterwarnings("ignore", category=DeprecationWarning)
     warnings.filterwarnings("ignore", category=FutureWarning)
     for name in ("prefect", "httpx", "alembic", "mlflow"):

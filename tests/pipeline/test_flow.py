@@ -46,7 +46,10 @@ def configuration(folder: Path, **changes: dict) -> dict:
     return config | rest
 
 
-ALL = "capture guess reconstruct segment fill learn simulate render simulate_initial render_initial evaluate".split()
+ALL = [
+    *("capture", "guess", "reconstruct", "segment", "fill", "learn", "simulate", "render"),
+    *("simulate_initial", "render_initial", "evaluate"),
+]
 
 
 @pytest.mark.parametrize(
@@ -58,12 +61,12 @@ ALL = "capture guess reconstruct segment fill learn simulate render simulate_ini
         (
             {"capture": {"roles": []}},
             {"learn": "no recorded motion", "evaluate": "no recorded motion"},
-            "capture guess reconstruct segment fill simulate render".split(),
+            ["capture", "guess", "reconstruct", "segment", "fill", "simulate", "render"],
         ),
         (
             {"learn": None},
             {"learn": "learn=null"},
-            "capture guess reconstruct segment fill simulate render evaluate".split(),
+            ["capture", "guess", "reconstruct", "segment", "fill", "simulate", "render", "evaluate"],
         ),
         ({"capture": {"roles": ["learn"]}}, {}, ALL),
     ],
