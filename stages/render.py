@@ -32,7 +32,7 @@ class Render:
         """Returns one video per camera. Raises ValueError if `view` is not in the capture."""
         cameras = self.cameras(capture)
         model = gaussians.to(self.device)
-        embedding = body.embedding.to(self.device)
+        embedding = body.embedding
         rest = trajectory.rest_position.to(self.device)
         background = torch.tensor(capture.background, device=self.device)
         videos: dict[str, list[torch.Tensor]] = {name: [] for name in cameras}
