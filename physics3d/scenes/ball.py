@@ -72,7 +72,7 @@ class BallTwin(AbstractSource):
         images, alphas, points, colors = photographs(
             studio.pose(), cameras, points=self.points, noise=2e-4, seed=self.seed, log=log
         )
-        position, volume = particles([(mesh, 0.0)], self.dx / 2, self.seed)
+        position, volume = particles([mesh], self.dx / 2, self.seed)
         push = Impulse(
             force=tuple(self.evaluate_force), centre=centre, radius=1.2 * RADIUS, start=0.0, duration=self.push
         )

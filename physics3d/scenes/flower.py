@@ -10,15 +10,14 @@ import numpy as np
 from physics3d.scenes.studio import Mesh, joined, smooth_noise, surface_grid, to_linear
 
 SOIL = 0.072  # height of the soil [m]
-STEM_TOP = 0.205  # height where the calyx begins [m]
-STEM_RADIUS = (0.0120, 0.0105)  # at the soil and at the top [m]
+STEM_TOP = 0.190  # height where the calyx begins [m]
+STEM_RADIUS = (0.0130, 0.0112)  # at the soil and at the top [m]
 BLOOM = (0.042, 0.034)  # half width and height of the visible blossom [m]
-DOME = (0.035, 0.028)  # the same of the space that is densely filled with petals [m]
-LEAF_THICKNESS = 0.0025  # [m]
+DOME = (0.034, 0.026)  # the same of the space that is densely filled with petals [m]
 PETALS = 52
 GOLDEN = np.pi * (3 - 5**0.5)
 # position along the stem, azimuth [rad], length [m]
-LEAVES = ((0.36, 0.5, 0.075), (0.38, 0.5 + np.pi, 0.082), (0.62, 2.2, 0.060), (0.63, 2.2 + np.pi, 0.056))
+LEAVES = ((0.36, 0.5, 0.060), (0.38, 0.5 + np.pi, 0.066), (0.62, 2.2, 0.050), (0.63, 2.2 + np.pi, 0.046))
 
 
 def stem_curve(s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -68,8 +67,8 @@ def revolved(
     return surface_grid(position, albedo, closed_b=True)
 
 
-def plant(seed: int) -> tuple[list[Mesh], list[tuple[Mesh, float]]]:
-    """What moves -> (visible meshes, [(closed mesh, 0) or (sheet, thickness [m])] that hold the material)."""
+def plant(seed: int) -> tuple[list[Mesh], list[Mesh]]:
+    """What moves -> (visible meshes, closed meshes that hold the material)."""
     rng = np.random.default_rng(seed)
     top, axes = frame_at_top()
     stem = _tube(rng)
@@ -78,14 +77,7 @@ def plant(seed: int) -> tuple[list[Mesh], list[tuple[Mesh, float]]]:
     leaves = [_leaf(rng, s, angle, length) for s, angle, length in LEAVES]
     sepals = [_placed(_sepal(rng, i), top, axes) for i in range(6)]
     petals = [_placed(_petal(rng, i), top, axes) for i in range(PETALS)]
-    green = joined([stem, calyx, *sepals])
-    visible = [green, joined(leaves), joined(petals)]
-    return [replace(m, moves=True) for m in visible], [
-        (stem, 0.0),
-        (calyx, 0.0),
-        (dome, 0.0),
-        *((l, LEAF_THICKNESS) for l in leaves),
-    ]
+    return [joined([stem, calyx, *sepals]), *leaves, joined(petals)], [stem, calyx, dome]
 
 
 def _placed(mesh: Mesh, origin: np.ndarray, axes: np.ndarray) -> Mesh:
@@ -110,7 +102,7 @@ def _tube(rng) -> Mesh:
         1 + 0.18 * smooth_noise(rng, len(s), 28, cells=(14, 7))[..., None]
     )
     lighter = np.exp(-(((s - 0.37) / 0.02) ** 2)) + np.exp(-(((s - 0.625) / 0.02) ** 2))
-    return surface_grid(position, albedo * (1 + 0.35 * lighter[:, None, None]), closed_b=True)
+    return surface_grid(position, albedo * (1 + 0.35 * lighter[:, None, None]), closed_b=True, moves=True)
 
 
 def _calyx(rng, top, axes) -> Mesh:
@@ -185,7 +177,7 @@ def _petal(rng, i: int) -> Mesh:
     albedo = (1 - tone) * base + tone * ((1 - 0.75 * rim) * blade + 0.75 * rim * edge)
     vein = 1 + 0.07 * np.cos(26 * u + 3 * np.sin(3 * v))
     albedo = albedo * (vein * (0.94 + 0.10 * rng.random()))[..., None]
-    return surface_grid(position, albedo, translucency=0.45)
+    return surface_grid(position, albedo, translucency=0.45, moves=True)
 
 
 def _leaf(rng, s: float, azimuth: float, length: float) -> Mesh:
@@ -196,7 +188,7 @@ def _leaf(rng, s: float, azimuth: float, length: float) -> Mesh:
     out -= tangent * (out @ tangent)
     out /= np.linalg.norm(out)
     across = np.cross(tangent, out)
-    rise = 0.55 + 0.1 * rng.normal()
+    rise = 0.75 + 0.1 * rng.normal()
     r = 0.008 + length * (0.86 * v + 0.1 * v**2)
     z = length * (rise * np.sin(1.9 * v) * 1.05 - 0.28 * v**2)
     width = 0.0062 * np.sqrt(np.clip(1 - v**3, 0, 1)) * (1 - 0.45 * v) + 0.0003
@@ -208,7 +200,13 @@ def _leaf(rng, s: float, azimuth: float, length: float) -> Mesh:
         + (width * u + sway)[..., None] * across
     )
     tone = 1 + 0.25 * np.exp(-((u / 0.15) ** 2)) - 0.12 * np.abs(u) + 0.1 * v
-    return surface_grid(position, to_linear(np.array((0.43, 0.58, 0.42))) * tone[..., None], translucency=0.25)
+    return surface_grid(
+        position,
+        to_linear(np.array((0.43, 0.58, 0.42))) * tone[..., None],
+        translucency=0.25,
+        moves=True,
+        anchor=tuple(start),
+    )
 
 
 def surroundings(seed: int) -> list[Mesh]:

@@ -1,6 +1,6 @@
 """A trained 3D Gaussian model (.ply of 3DGS): the capture already has its Gaussians, reconstruction is left out.
 
-The file holds no cameras, so they are put on a ring around the bulk of the model, and its own pictures from there are the
+The file holds no cameras, so they are put on a ring around the bulk of the model; its own pictures from there are the
 images. Turning the model to z up turns its spherical harmonics too: coefficients c' with Y(Q d) c' = Y(d) c for all d.
 """
 

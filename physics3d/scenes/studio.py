@@ -34,6 +34,9 @@ class Mesh:
     albedo: Float32[np.ndarray, "v 3"]  # linear reflectance, 0..1
     translucency: float = 0.0  # share of the light on the far side that comes through
     moves: bool = False  # carried by the simulation
+    anchor: tuple[float, float, float] | None = (
+        None  # carried as one piece by what is near here [m]; None: each by its own
+    )
     paint: Callable[[np.ndarray], np.ndarray] | None = (
         None  # positions [n, 3] -> factor [n, 3] on albedo; fixed meshes only
     )
@@ -59,6 +62,9 @@ class Studio:
         self.albedo = np.concatenate([m.albedo for m in meshes]).astype(np.float32)
         self.translucency = np.concatenate([np.full(len(m.faces), m.translucency, np.float32) for m in meshes])
         self.moves = np.concatenate([np.full(len(m.vertices), m.moves) for m in meshes])
+        self._anchors = np.concatenate(
+            [m.vertices if m.anchor is None else np.broadcast_to(m.anchor, m.vertices.shape) for m in meshes]
+        ).astype(np.float32)
         self.owner = np.concatenate([np.full(len(m.faces), i) for i, m in enumerate(meshes)])
         self.paints = {i: m.paint for i, m in enumerate(meshes) if m.paint is not None}
         sun = np.asarray(light.to_sun, np.float32)
@@ -69,6 +75,10 @@ class Studio:
         suns = [sun + SUN_SPREAD * (a * side + b * across) for a, b in ((-1, -0.4), (0.4, -1), (-0.4, 1), (1, 0.4))]
         self.suns = [s / np.linalg.norm(s) for s in suns]
         self.openness = self._bake(openness_rays, np.random.default_rng(seed))
+
+    def anchors(self) -> Float32[np.ndarray, "m 3"]:
+        """Where the particles that carry each moving vertex are looked for [m]."""
+        return self._anchors[self.moves]
 
     def rest(self) -> Float32[np.ndarray, "m 3"]:
         """The vertices that the simulation carries [m]."""

@@ -50,7 +50,7 @@ def film(
         log=log,
     )
     trajectory.check()
-    carrier = Carrier(studio.rest(), position, world.dx)
+    carrier = Carrier(studio.rest(), studio.anchors(), position, world.dx)
     videos: list[list[Tensor]] = [[] for _ in cameras]
     furthest = 0.0
     for t in log.progress(range(frames), f"filming the take to {role}"):
@@ -74,38 +74,24 @@ def film(
 
 
 def particles(
-    solids: list[tuple[Mesh, float]], spacing: float, seed: int
+    solids: list[Mesh], spacing: float, seed: int
 ) -> tuple[Float32[np.ndarray, "p 3"], Float32[np.ndarray, " p"]]:
-    """Material points of the reference motion: position [m], volume [m^3].
+    """Material points of closed meshes: position [m], volume [m^3].
 
-    `solids` are closed meshes with thickness 0, or sheets with their thickness [m]. Closed ones get one jittered point
-    per cube of side `spacing` [m], counted once where they overlap; sheets get points on their surface, about one per
-    spacing^2, each with its share of area * thickness.
+    One jittered point per cube of side `spacing` [m] inside, counted once where meshes overlap.
     """
     o3d = open3d()
     rng = np.random.default_rng(seed)
-    closed = [mesh for mesh, thickness in solids if not thickness]
-    lower, upper = (f([f(m.vertices, 0) for m in closed], 0) for f in (np.min, np.max))
+    lower, upper = (f([f(m.vertices, 0) for m in solids], 0) for f in (np.min, np.max))
     axes = [np.arange(a - spacing * rng.random(), b + spacing, spacing) for a, b in zip(lower, upper)]
     lattice = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     lattice = (lattice + 0.7 * spacing * (rng.random(lattice.shape) - 0.5)).astype(np.float32)
     inside = np.zeros(len(lattice), bool)
-    for mesh in closed:
+    for mesh in solids:
         scene = o3d.t.geometry.RaycastingScene()
         scene.add_triangles(o3d.core.Tensor(mesh.vertices), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
         inside |= scene.compute_occupancy(o3d.core.Tensor(lattice), nsamples=3).numpy() > 0.5
-    position, volume = [lattice[inside]], [np.full(inside.sum(), spacing**3)]
-    for mesh, thickness in solids:
-        if thickness:
-            a, b, c = (mesh.vertices[mesh.faces[:, i]].astype(np.float64) for i in range(3))
-            area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
-            count = max(1, round(area.sum() / spacing**2))
-            face = rng.choice(len(area), count, p=area / area.sum())
-            u, v = rng.random((2, count, 1))
-            u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-            position.append(a[face] + u * (b - a)[face] + v * (c - a)[face])
-            volume.append(np.full(count, area.sum() * thickness / count))
-    return np.concatenate(position).astype(np.float32), np.concatenate(volume).astype(np.float32)
+    return lattice[inside], np.full(inside.sum(), spacing**3, np.float32)
 
 
 @dataclass(frozen=True)
@@ -113,6 +99,7 @@ class Carrier:
     """Which particles carry which vertices, fixed in the rest state."""
 
     rest: Float[np.ndarray, "v 3"]
+    anchors: Float[np.ndarray, "v 3"]  # the nearest particles are sought from here
     particles: Float[np.ndarray, "p 3"]
     reach: float  # h of the weights [m]
     neighbours: np.ndarray = field(init=False)  # [v, k]
@@ -121,7 +108,7 @@ class Carrier:
     def __post_init__(self):
         from scipy.spatial import cKDTree
 
-        distance, index = cKDTree(self.particles).query(self.rest, k=min(12, len(self.particles)))
+        distance, index = cKDTree(self.particles).query(self.anchors, k=min(12, len(self.particles)))
         distance, index = distance.reshape(len(self.rest), -1), index.reshape(len(self.rest), -1)
         # relative to the nearest, so that a vertex far outside keeps its weights
         weight = np.exp(-(distance**2 - distance[:, :1] ** 2) / self.reach**2)
