@@ -24,7 +24,8 @@ from torch import Tensor
 from physics3d.artifact import AbstractArtifact, require_finite
 from physics3d.log import Log
 from physics3d.mpm.boundaries.base import AbstractBoundary, Setting, Vector
-from physics3d.mpm.substep import Hook, Substeps
+from physics3d.mpm.substep import Hook, Substeps, start_warp
+from physics3d.mpm.transfer import velocity_gradient
 from physics3d.mpm.world import World
 
 RUN = 32  # substeps between two looks at the particles, and between two checkpoints
@@ -85,6 +86,12 @@ def rollout(
     mass = world.density * volume.detach().double().cpu()
     setting = Setting(position=position.detach().double().cpu(), mass=mass, lower=lower, upper=upper, dx=world.dx)
 
+    if velocity.ndim == 1:
+        gradient = torch.zeros(n, 3, 3)
+    else:
+        x, v = position.double(), velocity.double().to(position.device)
+        gradient = velocity_gradient(x / world.dx, v, mass.to(x.device)) / world.dx
+
     # neighbours in space are neighbours in memory
     order = _sorted_by_cell(setting.position, world.dx).to(device)
     back = torch.argsort(order)
@@ -111,6 +118,7 @@ def rollout(
         coefficients,
         place(torch.cat(q)) if q else torch.zeros(0, dtype=dtype, device=device),
         place(velocity.to(device).expand(n, 3)[order]),
+        place(gradient.to(device)[order]),
         position.to(device=device, dtype=torch.float64)[order],
         solver,
     )
@@ -157,14 +165,18 @@ class _Solver:
     counts: list[int] = field(default_factory=list)  # substeps of each frame
     health: dict[str, list[float]] = field(default_factory=dict)
 
-    def forward(self, coefficients: Tensor, q: Tensor, velocity: Tensor, position: Tensor, keep: bool):
+    def forward(
+        self, coefficients: Tensor, q: Tensor, velocity: Tensor, gradient: Tensor, position: Tensor, keep: bool
+    ) -> tuple[Tensor, Tensor]:
         """Displacements [t, p, 3] and total deformations [t, p, 3, 3]."""
+        start_warp()
         substeps = self._build(coefficients, q, position)
         self.substeps, self.coefficients = substeps, coefficients
         self.modulus = self.world.material.wave_modulus(coefficients)
         first, now = substeps.state(0), substeps.state(1)
         first.memory.copy_(self.world.material.initial_memory(len(position), self.world.dtype))
         first.v_gathered.copy_(velocity)
+        first.L_gathered.copy_(gradient)
         self.initial = first.flat.clone()
         substeps.start(self._clock(0.0, 0.0, 1), 0, 1)
         self.runs: list[list[_Run]] = []
@@ -181,8 +193,8 @@ class _Solver:
                 self.health.setdefault(name, []).append(value)
         return u, deformation
 
-    def backward(self, adjoint_u: Tensor, adjoint_F: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Gradients of coefficients, q, velocity and position."""
+    def backward(self, adjoint_u: Tensor, adjoint_F: Tensor) -> tuple[Tensor, ...]:
+        """Gradients of coefficients, q, velocity, its gradient, and position."""
         substeps = self.substeps
         substeps.begin_adjoint()
         side = 0
@@ -201,7 +213,7 @@ class _Solver:
         substeps.state(0).flat.copy_(self.initial)
         substeps.start(self._clock(0.0, 0.0, 1), 0, 1)
         side = substeps.reverse_start(self._clock(0.0, 0.0, 1), 0, 1, side)
-        return substeps.gradients(states[side].v_gathered)
+        return substeps.gradients(states[side])
 
     def _frame(self, frame: int, keep: bool) -> None:
         """From one frame to the next, in equal substeps that obey the limit; more of them if it turns out too fast."""
@@ -292,7 +304,7 @@ class _Solver:
         return (mean + 2 * p * torch.cos(torch.acos(r) / 3)).clamp(min=0).sqrt(), torch.linalg.det(F)
 
     def _speeds(self, now) -> tuple[float, float]:
-        """(fastest wave, fastest particle) [m/s]. Waves are s times faster at stretch s; strong compression stiffens."""
+        """(fastest wave, fastest particle) [m/s]. Waves are s times faster at stretch s; compression stiffens."""
         stretch, J = self._stretch(now)
         stiffening = stretch.clamp(min=1) * (1 - J.clamp(1e-4, 1).log()).sqrt()
         c = ((self.modulus.double() / self.world.density).sqrt() * stiffening).max()
@@ -400,13 +412,15 @@ class _Solver:
 
 
 class _Rollout(torch.autograd.Function):
-    """(coefficients [k, p], q, velocity and position [p, 3]) -> displacement [t, p, 3], deformation [t, p, 3, 3]."""
+    """(coefficients [k, p], q, velocity [p, 3], its gradient [p, 3, 3], position [p, 3]) -> displacement [t, p, 3],
+    deformation [t, p, 3, 3]."""
 
     @staticmethod
-    def forward(ctx, coefficients, q, velocity, position, solver: _Solver):
+    def forward(ctx, coefficients, q, velocity, gradient, position, solver: _Solver):
         ctx.solver = solver
         keep = any(ctx.needs_input_grad)
-        return solver.forward(coefficients.detach(), q.detach(), velocity.detach(), position.detach(), keep)
+        inputs = (coefficients, q, velocity, gradient, position)
+        return solver.forward(*(value.detach() for value in inputs), keep)
 
     @staticmethod
     def backward(ctx, adjoint_u, adjoint_F):

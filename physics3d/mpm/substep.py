@@ -181,6 +181,12 @@ def _advance(real, material: wp.Function, plastic: bool) -> wp.Kernel:
     return advance_kernel
 
 
+def start_warp() -> None:
+    """Start Warp without its banner; before anything else of Warp is touched."""
+    wp.config.log_level = wp.LOG_WARNING
+    wp.init()
+
+
 class Substeps:
     """All arrays and recorded launches of one rollout; runs substeps forwards and backwards between numbered states.
 
@@ -212,8 +218,6 @@ class Substeps:
         longest_run: int,  # substeps
         threads: int,
     ):
-        wp.config.quiet = True
-        wp.init()
         self.dtype, self.device = mass.dtype, mass.device
         self.real = wp.float32 if self.dtype == torch.float32 else wp.float64
         self.n, self.dx = len(mass), dx
@@ -394,12 +398,14 @@ class Substeps:
         then.L_gathered.add_(now.L_gathered)
         return 1 - side
 
-    def gradients(self, adjoint_velocity: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Gradients of coefficients [k, p], q, initial velocity [p, 3] and rest position [p, 3] (copies)."""
+    def gradients(self, first: State) -> tuple[torch.Tensor, ...]:
+        """Gradients of coefficients [k, p], q, initial velocity [p, 3], its gradient [p, 3, 3], and rest position [p, 3],
+        from the adjoint of the first state (copies)."""
         assert self.adjoint is not None
         q = torch.stack([wp.to_torch(array) for array in self.adjoint["q"]]).sum(0)[: self.parameter_count]
         place = wp.to_torch(self.adjoint["rest"]) + wp.to_torch(self.adjoint["offset"]) / self.dx
-        return wp.to_torch(self.adjoint["coefficients"]).clone(), q, adjoint_velocity.clone(), place.double()
+        coefficients = wp.to_torch(self.adjoint["coefficients"]).clone()
+        return coefficients, q, first.v_gathered.clone(), first.L_gathered.clone(), place.double()
 
     # ------------------------------------------------------------------------------------------------ launches
 

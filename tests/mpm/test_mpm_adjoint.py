@@ -1,4 +1,4 @@
-"""The gradient of a whole rollout is the derivative of that rollout: against central differences, in double precision."""
+"""The gradient of a whole rollout is its derivative: against central differences, in double precision."""
 
 import dataclasses
 

@@ -4,9 +4,9 @@
     node           velocity of a grid node -> velocity of that node                 (walls, colliders, held regions)
     steer          velocity and its gradient of selected particles after the gather  (motion imposed on the body itself)
 
-The solver calls whatever is there, in the order of the list, and never asks which one it has. A boundary's numbers are of
-two kinds: `parameters` are constant during a rollout, differentiable, and travel in one vector; `signals` depend on time
-and are computed on the host in float64 for every substep, so that a window in time is exact whatever the substep is.
+The solver calls whatever is there, in the order of the list, and never asks which one it has. A boundary's numbers are
+of two kinds: `parameters` are constant during a rollout, differentiable, and travel in one vector; `signals` depend on
+time and are computed on the host in float64 for every substep, so that a window in time is exact whatever dt is.
 """
 
 import abc

@@ -1,7 +1,7 @@
 """Enforced rotation: part of the body is held and turned about an axis (a hand that twists a stem).
 
-The particles that are in a cylinder AT REST turn rigidly with `angular_velocity` w about the axis k through `point`, while
-start <= t < start + duration. Over one substep the turn is exact, so the radius is kept:
+The particles that are in a cylinder AT REST turn rigidly with `angular_velocity` w about the axis k through `point`,
+while start <= t < start + duration. Over one substep the turn is exact, so the radius is kept:
 
     v = (R(w dt) - I)(x - point)/dt = [ sin(w dt) k x r + (1 - cos(w dt)) k x (k x r) ]/dt,     L = (R(w dt) - I)/dt
 """
