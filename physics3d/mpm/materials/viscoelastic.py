@@ -190,33 +190,6 @@ def _advance(branches: int, elastic: bool, spring: str, real: type) -> wp.Functi
         j = volume_change(H)
         return real(2.0) * mu * (Y + Y * Y) + lam * (real(1.0) + j) * j * wp.identity(n=3, dtype=real)
 
-    @wp.func(name=f"branch_{key}")
-    def branch(
-        p: int,
-        row: int,
-        k: int,
-        dt: real,
-        M: mat33,
-        coefficients: wp.array2d(dtype=real),
-        memory: wp.array2d(dtype=real),
-        memory_next: wp.array2d(dtype=real),
-    ):
-        xx, xy, xz = memory[row, p], memory[row + 1, p], memory[row + 2, p]
-        yy, yz, zz = memory[row + 3, p], memory[row + 4, p], memory[row + 5, p]
-        X = mat33(xx, xy, xz, xy, yy, yz, xz, yz, zz)
-        N = M + M * X
-        X = X + N + wp.transpose(N) + N * wp.transpose(M)
-        d = dt * coefficients[k + 2, p]
-        v = dt * coefficients[k + 3, p]
-        tau, X_next = maxwell(X, coefficients[k, p], coefficients[k + 1, p], d, v)
-        memory_next[row, p] = X_next[0, 0]
-        memory_next[row + 1, p] = X_next[0, 1]
-        memory_next[row + 2, p] = X_next[0, 2]
-        memory_next[row + 3, p] = X_next[1, 1]
-        memory_next[row + 4, p] = X_next[1, 2]
-        memory_next[row + 5, p] = X_next[2, 2]
-        return tau
-
     @wp.func(name=f"viscoelastic_{key}")
     def advance(
         p: int,
@@ -229,11 +202,30 @@ def _advance(branches: int, elastic: bool, spring: str, real: type) -> wp.Functi
     ):
         M = dt * L
         H_next = H + M + M * H
-        tau = wp.matrix(shape=(3, 3), dtype=real)
+        tau = mat33()
         if wp.static(elastic):
             tau = tau + corotated(H_next, coefficients[0, p], coefficients[1, p])
+        # unrolled, and flat: each nested function would be evaluated once more in the adjoint
         for i in range(wp.static(branches)):
-            tau = tau + branch(p, 6 * i, first + 4 * i, dt, M, coefficients, memory, memory_next)
+            xx, xy, xz = memory[6 * i, p], memory[6 * i + 1, p], memory[6 * i + 2, p]
+            yy, yz, zz = memory[6 * i + 3, p], memory[6 * i + 4, p], memory[6 * i + 5, p]
+            X = mat33(xx, xy, xz, xy, yy, yz, xz, yz, zz)
+            N = M + M * X
+            k = first + 4 * i
+            tau_N, X_next = maxwell(
+                X + N + wp.transpose(N) + N * wp.transpose(M),
+                coefficients[k, p],
+                coefficients[k + 1, p],
+                dt * coefficients[k + 2, p],
+                dt * coefficients[k + 3, p],
+            )
+            tau = tau + tau_N
+            memory_next[6 * i, p] = X_next[0, 0]
+            memory_next[6 * i + 1, p] = X_next[0, 1]
+            memory_next[6 * i + 2, p] = X_next[0, 2]
+            memory_next[6 * i + 3, p] = X_next[1, 1]
+            memory_next[6 * i + 4, p] = X_next[1, 2]
+            memory_next[6 * i + 5, p] = X_next[2, 2]
         return H_next, tau
 
     return advance
