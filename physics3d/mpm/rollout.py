@@ -219,7 +219,7 @@ class _Solver:
         """From one frame to the next, in equal substeps that obey the limit; more of them if it turns out too fast."""
         start = self.substeps.state(self.current).flat.clone()
         count, reach = self._count(frame), 2.0
-        for _ in range(TRIES):
+        for _ in range(TRIES if self.world.dt is None else 3):
             try:
                 self.runs.append(self._runs(frame, count, reach, keep))
                 self.counts.append(count)
@@ -227,11 +227,13 @@ class _Solver:
             except _TooFast as reason:
                 why = str(reason)
                 self.substeps.state(self.current).flat.copy_(start)
-                reach *= 4.0
+                reach = min(2 * reach, 8.0)
                 if self.world.dt is None:
                     count *= 2
         dt = self.frame_dt / count
-        remedy = "a smaller cfl, a softer material or a weaker force" if self.world.dt is None else f"dt < {dt / 2:g}"
+        remedy = (
+            "a smaller cfl, a softer material or a weaker force" if self.world.dt is None else f"world.dt < {dt / 2:g}"
+        )
         raise ValueError(f"frame {frame}: {why} with substeps of {dt:g} s; take {remedy}")
 
     def _runs(self, frame: int, count: int, reach: float, keep: bool) -> list[_Run]:

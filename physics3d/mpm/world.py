@@ -1,5 +1,6 @@
 """What a scene says of its physics, and what learning found out about it."""
 
+import math
 from dataclasses import dataclass, field
 
 import torch
@@ -47,12 +48,13 @@ class World:
     def check(self) -> None:
         """Raise ValueError naming field, value and remedy."""
         for name in ("density", "dx"):
-            _require(getattr(self, name) > 0, name, getattr(self, name), "a number above 0")
+            _require(0 < getattr(self, name) < math.inf, name, getattr(self, name), "a number above 0")
         _require(0 < self.cfl <= 1, "cfl", self.cfl, "0 < cfl <= 1")
-        _require(self.damping >= 0, "damping", self.damping, "a rate >= 0 1/s")
+        _require(0 <= self.damping < math.inf, "damping", self.damping, "a rate >= 0 1/s")
         _require(self.dt is None or self.dt > 0, "dt", self.dt, "a time above 0 s, or None")
         _require(self.precision in PRECISIONS, "precision", self.precision, f"one of {tuple(PRECISIONS)}")
-        _require(len(self.gravity) == 3, "gravity", self.gravity, "three numbers [m/s^2]")
+        finite = len(self.gravity) == 3 and all(math.isfinite(g) for g in self.gravity)
+        _require(finite, "gravity", self.gravity, "three finite numbers [m/s^2]")
         _require((self.lower is None) == (self.upper is None), "lower", self.lower, "lower and upper, or neither")
         if self.lower is not None and self.upper is not None:
             ordered = all(b - a >= self.dx for a, b in zip(self.lower, self.upper))

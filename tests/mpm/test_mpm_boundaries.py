@@ -183,7 +183,9 @@ def test_enforced_rotation_keeps_the_radius_and_turns_the_deformation():
 
 
 def test_layers_are_released_one_after_the_other():
-    layers = SequentialRelease(lower=(0, 0, 0), upper=(1, 1, 1), direction=(0, 0, 1), layers=3, start=0.05, interval=0.1)
+    layers = SequentialRelease(
+        lower=(0, 0, 0), upper=(1, 1, 1), direction=(0, 0, 1), layers=3, start=0.05, interval=0.1
+    )
     world = soft_world(gravity=FALL)
     trajectory = simulate(world, frames=5, frame_dt=0.1, excitation=(layers,), cells=(1, 1, 3))
     height = trajectory.position[0, :, 2]
@@ -205,4 +207,4 @@ def test_boundaries_act_together():
     )
     push = MovingCuboid(lower=(-1, -1, -1), upper=(0.0, 1, 1), velocity=(0.5, 0, 0), duration=0.3)
     x = simulate(world, frames=7, frame_dt=0.05, excitation=(push,)).position[-1]
-    assert float(x[:, 2].min()) > 0.0 and 0.35 < float(x[:, 0].max()) < 0.42 and float(x[:, 0].min()) > 0.11
+    assert float(x[:, 2].min()) > 0.0 and 0.3 < float(x[:, 0].max()) < 0.4 and float(x[:, 0].min()) > 0.11

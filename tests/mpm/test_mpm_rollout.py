@@ -251,7 +251,9 @@ def test_stiff_body_in_single_precision_follows_double_precision():
     final = []
     for precision in ("float32", "float64"):
         world = soft_world(precision=precision, start=dict(youngs_modulus=1e9, poissons_ratio=0.3))
-        final.append(simulate(world, position, volume, frames=3, frame_dt=1e-4, velocity=velocity).deformation[-1].double())
+        final.append(
+            simulate(world, position, volume, frames=3, frame_dt=1e-4, velocity=velocity).deformation[-1].double()
+        )
     H = [F - torch.eye(3) for F in final]
     assert 1e-6 < float(H[1].abs().max()) < 1e-3
     # one per cent of the largest strain, hence of the stress
@@ -265,7 +267,9 @@ def test_two_elastic_blocks_bounce_without_creating_energy():
     position = torch.cat([left, right])
     velocity = torch.zeros_like(position)
     velocity[:64, 0], velocity[64:, 0] = 0.5, -0.5
-    trajectory = simulate(soft_world(), position, torch.cat([volume, volume]), frames=21, frame_dt=0.05, velocity=velocity)
+    trajectory = simulate(
+        soft_world(), position, torch.cat([volume, volume]), frames=21, frame_dt=0.05, velocity=velocity
+    )
     middle = trajectory.position[:, 64:, 0].mean(1) - trajectory.position[:, :64, 0].mean(1)
     # free until the grid feels them, one and a half cells apart: 0.1 s at 1 m/s
     torch.testing.assert_close(middle[:3], 0.5 - 0.05 * torch.arange(3, dtype=torch.float64), atol=1e-9, rtol=0)
