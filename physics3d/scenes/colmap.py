@@ -135,6 +135,8 @@ def _read_text(files: tuple[Path, ...]) -> _Model:
     try:
         file = files[0]
         for words in _lines(file):
+            if words[1] in PARAMETERS and len(words) != 4 + len(PARAMETERS[words[1]]):
+                raise ValueError(f"camera {words[0]} has {len(words) - 4} parameters, {words[1]} needs another number")
             model.lenses[int(words[0])] = _Lens(words[1], int(words[2]), int(words[3]), tuple(map(float, words[4:])))
         file = files[1]
         lines = [line for line in file.read_text().splitlines() if not line.startswith("#")]
@@ -147,6 +149,8 @@ def _read_text(files: tuple[Path, ...]) -> _Model:
         file = files[2]
         xyz, rgb, index, view = [], [], [], []
         for i, words in enumerate(_lines(file)):
+            if len(words) < 8 or len(words) % 2:
+                raise ValueError(f"line of point {i + 1} is cut short")
             xyz.append([float(w) for w in words[1:4]])
             rgb.append([int(w) for w in words[4:7]])
             track = [int(w) for w in words[8::2]]
@@ -220,10 +224,9 @@ def _camera(lens: _Lens, view: _View, path: Path, size: tuple[int, int], axes: A
             f"{path} has {size[0]} x {size[1]} pixels, COLMAP's camera {view.lens} says {lens.width} x {lens.height}; "
             "camera file and images disagree, resize one of them"
         )
-    if lens.model not in PARAMETERS or len(lens.parameters) != len(PARAMETERS[lens.model]):
+    if lens.model not in PARAMETERS:
         raise ValueError(
-            f"{path}: camera model {lens.model} with {len(lens.parameters)} parameters; known are {list(PARAMETERS)}, "
-            "run colmap image_undistorter first"
+            f"{path}: camera model {lens.model} is not one of {list(PARAMETERS)}; run colmap image_undistorter"
         )
     p = dict(zip(PARAMETERS[lens.model], lens.parameters))
     fx, fy = p.get("fx", p.get("f")), p.get("fy", p.get("f"))
@@ -238,7 +241,8 @@ def _camera(lens: _Lens, view: _View, path: Path, size: tuple[int, int], axes: A
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
             [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
+        ],
+        dtype=torch.float64,
     )
     M[:3, 3] = torch.tensor(view.translation, dtype=torch.float64)
     rigid_inverse(M, str(path))
