@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import torch
 
-from physics3d.gaussians.fit import Photograph, Rates, fit, from_points, held_out_psnr, random_points
+from physics3d.gaussians.fit import Photograph, Rates, background_points, fit, from_points, held_out_psnr, random_points
 from physics3d.gaussians.model import Gaussians
 from physics3d.gaussians.ply import write_ply
 from physics3d.gaussians.render import render
@@ -100,14 +100,17 @@ class Reconstruct:
         return result
 
     def start(self, capture: Capture, training: list[Photograph]) -> Gaussians:
-        """From the capture's points if there are any, else from random points that the cameras have in common."""
+        """From the capture's points, if any, and points of the background, else from random points seen in common."""
         generator = torch.Generator().manual_seed(self.seed)
         count = max(1, self.max_gaussians // 2)
         if capture.points is None:
             points, colors = random_points(training, count, generator)
         else:
-            pick = torch.randperm(len(capture.points), generator=generator)[:count]
-            points = capture.points[pick]
+            pick = torch.randperm(len(capture.points), generator=generator)[: max(1, 4 * count // 5)]
+            points = capture.points[pick].float()
             gray = torch.full_like(points, 0.5)
             colors = gray if capture.point_colors is None else capture.point_colors[pick]
+            if not capture.alphas:
+                far, far_colors = background_points(training, points, 1 + len(points) // 4, generator)
+                points, colors = torch.cat([points, far]), torch.cat([colors, far_colors])
         return from_points(points, colors, sh_degree=self.sh_degree)

@@ -134,6 +134,29 @@ def random_points(photographs: list[Photograph], count: int, generator: torch.Ge
     return torch.cat(points)[:count].float(), torch.cat(colors)[:count]
 
 
+def background_points(
+    photographs: list[Photograph], points: Tensor, count: int, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Points [count, 3] [m] on rays through random pixels, as far as the farther half of `points`, with their colours.
+
+    Structure from motion finds nothing on bare walls; without these, holes stay there.
+    """
+    found, colors = [], []
+    for i, share in enumerate(torch.arange(count).chunk(min(count, len(photographs)))):
+        photograph = photographs[(i * len(photographs)) // min(count, len(photographs))]
+        uv, z = photograph.camera.project(points.double())
+        w, h = photograph.camera.width, photograph.camera.height
+        inside = (z > NEAR) & (uv >= 0).all(-1) & (uv[:, 0] < w) & (uv[:, 1] < h)
+        if not inside.any():
+            continue
+        pixel = torch.randint(w * h, (len(share),), generator=generator)
+        level = 0.5 + 0.5 * torch.rand(len(share), generator=generator, dtype=torch.float64)
+        origin, direction = photograph.camera.rays(torch.float64)
+        found.append(origin + torch.quantile(z[inside], level)[:, None] * direction.reshape(-1, 3)[pixel])
+        colors.append(photograph.color.reshape(-1, 3)[pixel])
+    return (torch.cat(found).float(), torch.cat(colors)) if found else (points[:0].float(), torch.zeros(0, 3))
+
+
 def fit(
     start: Gaussians,
     photographs: list[Photograph],
@@ -181,7 +204,7 @@ def fit(
         model = _adam(model, moments, rates, extent, step, iterations)
         value = psnr(image.detach(), truth)
         recent = value if math.isnan(recent) else 0.95 * recent + 0.05 * value
-        steps.set_postfix(psnr=f"{recent:.1f} dB", gaussians=len(model), refresh=False)
+        steps.set_postfix(psnr=f"{recent:.1f} dB", gaussians=str(len(model)), refresh=False)
 
         done = (step + 1) / iterations
         if (step + 1) % densify_every == 0 and GROWTH[0] <= done <= GROWTH[1]:
