@@ -399,8 +399,8 @@ class Substeps:
         return 1 - side
 
     def gradients(self, first: State) -> tuple[torch.Tensor, ...]:
-        """Gradients of coefficients [k, p], q, initial velocity [p, 3], its gradient [p, 3, 3], and rest position [p, 3],
-        from the adjoint of the first state (copies)."""
+        """Gradients of coefficients [k, p], q, initial velocity [p, 3], its gradient [p, 3, 3], and rest position
+        [p, 3], from the adjoint of the first state (copies)."""
         assert self.adjoint is not None
         q = torch.stack([wp.to_torch(array) for array in self.adjoint["q"]]).sum(0)[: self.parameter_count]
         place = wp.to_torch(self.adjoint["rest"]) + wp.to_torch(self.adjoint["offset"]) / self.dx

@@ -239,13 +239,13 @@ def total(dtype) -> wp.Kernel:
 def velocity_gradient(
     x: Float[Tensor, "p 3"], v: Float[Tensor, "p 3"], mass: Float[Tensor, " p"]
 ) -> Float[Tensor, "p 3 3"]:
-    """Gradient [v per unit of x] at the particles of a field of particle velocities; x in cells, float64, differentiable.
+    """Gradient, per unit of x, of a field of particle velocities at the particles; x in cells, float64, differentiable.
 
         L_p = sum_i w_ip v_i r_i^T ( sum_i w_ip r_i r_i^T )^-1,   r_i = x_i - sum_j w_jp x_j
 
-    over the nodes' mean velocities v_i and centres of mass x_i: exact for linear fields, zero across a sheet. A body that
-    starts to spin or to stretch needs it: with L = 0 the first scatter would take the part of the motion that lives
-    below a cell (a quarter of the angular momentum of a body three cells wide)."""
+    over the nodes' mean velocities v_i and centres of mass x_i: exact for linear fields, zero across a sheet. A body
+    that starts to spin or to stretch needs it: with L = 0 the first scatter would take the part of the motion that
+    lives below a cell (a quarter of the angular momentum of a body three cells wide)."""
     base = (x.detach() - 0.5).floor()
     f = x - base
     w = torch.stack([0.5 * (1.5 - f) ** 2, 0.75 - (f - 1) ** 2, 0.5 * (f - 0.5) ** 2])

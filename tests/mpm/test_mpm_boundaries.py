@@ -23,11 +23,9 @@ FALL = (0.0, 0.0, -9.81)
 
 def simulate(world, *, frames, frame_dt, cells=(3, 3, 3), lower=(0.0, 0.0, 0.0), **more):
     position, volume = block(cells, world.dx, lower=lower)
+    more |= dict(frames=frames, frame_dt=frame_dt, threads=1, log=Log(None))
     with torch.no_grad():
-        trajectory = rollout(
-            world, tensors(world.start), position, volume, frames=frames, frame_dt=frame_dt, threads=1, log=Log(None), **more
-        )  # fmt: skip
-    return trajectory
+        return rollout(world, tensors(world.start), position, volume, **more)
 
 
 @pytest.mark.parametrize("boundary", every_boundary(), ids=lambda b: f"{type(b).__name__}-{getattr(b, 'kind', '')}")

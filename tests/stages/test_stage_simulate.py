@@ -1,0 +1,73 @@
+"""The simulate stage on a small body: its trajectory, its metrics and its picture."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+
+from physics3d.filling import Body
+from physics3d.gaussians.deform import embed
+from physics3d.log import METRICS, Log
+from physics3d.mpm.boundaries.half_space import HalfSpace
+from physics3d.mpm.boundaries.impulse import Impulse
+from physics3d.mpm.materials.neo_hookean import NeoHookean
+from physics3d.mpm.rollout import Trajectory
+from physics3d.mpm.world import World
+from stages.simulate import Simulate
+
+SPACING = 0.05
+WORLD = World(
+    material=NeoHookean(),
+    density=1000.0,
+    start=dict(youngs_modulus=1e4, poissons_ratio=0.3),
+    dx=0.1,
+    gravity=(0.0, 0.0, -9.81),
+    boundaries=(HalfSpace(point=(0.0, 0.0, 0.0), normal=(0.0, 0.0, 1.0)),),
+)
+
+
+@pytest.fixture
+def body() -> Body:
+    axis = (torch.arange(4) + 0.5) * SPACING
+    position = torch.cartesian_prod(axis, axis, axis)
+    count = len(position)
+    return Body(
+        position=position,
+        volume=torch.full((count,), SPACING**3),
+        part=torch.zeros(count, dtype=torch.int32),
+        interior=torch.ones(count, dtype=torch.bool),
+        spacing=SPACING,
+        embedding=embed(position[:8] + 0.01, torch.arange(8), position, SPACING),
+    )
+
+
+def test_stage_gives_a_trajectory_that_survives_a_file_with_metrics_and_a_picture(body, tmp_path):
+    poke = Impulse(force=(2.0, 0.0, 0.0), centre=(0.1, 0.1, 0.2), radius=0.1, duration=0.05)
+    log = Log(tmp_path, name="simulate", quiet=True)
+    trajectory = Simulate(world=WORLD, frames=6, fps=20.0, excitation=(poke,))(body, WORLD.estimate(), log=log)
+    assert trajectory.position.shape == (6, 64, 3) and trajectory.deformation.shape == (6, 64, 3, 3)
+    assert trajectory.fps == pytest.approx(20.0) and not trajectory.position.requires_grad
+    assert float((trajectory.position[-1] - trajectory.rest_position).norm(dim=1).max()) > 1e-3
+    trajectory.save(tmp_path)
+    assert torch.equal(Trajectory.load(tmp_path).position, trajectory.position)
+    metrics = [json.loads(line) for line in (tmp_path / METRICS).read_text().splitlines()]
+    assert {m["step"] for m in metrics if m["name"] == "health/speed_max"} == set(range(6))
+    mass = [m["value"] for m in metrics if m["name"] == "mass"]
+    assert mass == [pytest.approx(1000.0 * 64 * SPACING**3, rel=1e-5)]  # volumes in float32
+    assert (tmp_path / "previews" / "motion.png").stat().st_size > 10_000
+
+
+def test_initial_velocity_of_the_estimate_is_used(body):
+    world = replace(WORLD, gravity=(0.0, 0.0, 0.0), boundaries=())
+    estimate = replace(world.estimate(), velocity=torch.tensor((0.3, 0.0, 0.0)))
+    x = Simulate(world=world, frames=3, fps=10.0)(body, estimate, log=Log(None)).position
+    # uniform motion, single precision
+    expected = body.position + torch.tensor((0.06, 0.0, 0.0))
+    torch.testing.assert_close(x[-1], expected, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("fps", [0.0, -1.0, float("nan"), float("inf")])
+def test_senseless_fps_is_refused(body, fps):
+    with pytest.raises(ValueError, match=r"simulate\.fps is"):
+        Simulate(world=WORLD, frames=3, fps=fps)(body, WORLD.estimate(), log=Log(None))
