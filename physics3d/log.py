@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 METRICS, PREVIEWS, LINES = "metrics.jsonl", "previews", "log.txt"
+LINES_EVERY = 15.0  # between two lines of progress where there is no screen [s]
 
 
 class Log:
@@ -67,12 +68,30 @@ class Log:
         """`items` behind a bar with an estimate; call `.set_postfix(loss=...)` on what is returned."""
         from tqdm import tqdm
 
+        screen = sys.stderr.isatty()
         return tqdm(
             items,
             desc=f"{self.name:>16} | {description}",
             total=total,
             disable=self.quiet,
-            mininterval=0.2 if sys.stderr.isatty() else 15.0,
+            file=sys.stderr if screen else _Lines(),
+            bar_format=None if screen else "{desc}: {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]",
             leave=False,
-            dynamic_ncols=True,
+            dynamic_ncols=screen,
         )
+
+
+class _Lines:
+    """Where a bar goes if nobody watches a screen: a line every `LINES_EVERY` seconds."""
+
+    def __init__(self):
+        self.last = time.monotonic()
+
+    def write(self, text: str) -> None:
+        line = text.strip("\r\n").rstrip()
+        if line and time.monotonic() - self.last >= LINES_EVERY:
+            self.last = time.monotonic()
+            print(line, file=sys.stderr, flush=True)
+
+    def flush(self) -> None:
+        pass

@@ -124,7 +124,7 @@ def _quiet() -> None:
     """Libraries talk to themselves; the person watching reads our lines."""
     import warp
 
-    warp.config.quiet = True
+    warp.config.log_level = warp.LOG_ERROR
     warnings.filterwarnings("ignore", category=DeprecationWarning)
     warnings.filterwarnings("ignore", category=FutureWarning)
     for name in ("prefect", "httpx", "alembic", "mlflow"):
