@@ -190,6 +190,12 @@ def _advance(branches: int, elastic: bool, spring: str, real: type) -> wp.Functi
         j = volume_change(H)
         return real(2.0) * mu * (Y + Y * Y) + lam * (real(1.0) + j) * j * wp.identity(n=3, dtype=real)
 
+    @wp.func(name=f"stored_strain_{real.__name__}")
+    def stored(p: int, row: int, memory: wp.array2d(dtype=real)):
+        xx, xy, xz = memory[row, p], memory[row + 1, p], memory[row + 2, p]
+        yy, yz, zz = memory[row + 3, p], memory[row + 4, p], memory[row + 5, p]
+        return mat33(xx, xy, xz, xy, yy, yz, xz, yz, zz)
+
     @wp.func(name=f"viscoelastic_{key}")
     def advance(
         p: int,
@@ -207,9 +213,7 @@ def _advance(branches: int, elastic: bool, spring: str, real: type) -> wp.Functi
             tau = tau + corotated(H_next, coefficients[0, p], coefficients[1, p])
         # unrolled, and flat: each nested function would be evaluated once more in the adjoint
         for i in range(wp.static(branches)):
-            xx, xy, xz = memory[6 * i, p], memory[6 * i + 1, p], memory[6 * i + 2, p]
-            yy, yz, zz = memory[6 * i + 3, p], memory[6 * i + 4, p], memory[6 * i + 5, p]
-            X = mat33(xx, xy, xz, xy, yy, yz, xz, yz, zz)
+            X = stored(p, 6 * i, memory)
             N = M + M * X
             k = first + 4 * i
             tau_N, X_next = maxwell(
