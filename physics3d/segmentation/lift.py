@@ -59,14 +59,15 @@ def islands(
 ) -> Bool[Tensor, " n"]:
     """Moving Gaussians in clusters that hold less than `share` of the main one's opacity, and lie apart from it.
 
-    Clusters are separated by `gap` times the (robust) size of what moves.
+    Clusters are separated by `gap` times the (robust) size of what moves, or more where Gaussians are sparse.
     """
     moving = torch.nonzero(label > 0).flatten()
     found = torch.zeros(len(mean), dtype=torch.bool)
     if len(moving) < 2:
         return found
     position = mean[moving].double().numpy()
-    h = gap * extent(mean[moving])
+    apart = cKDTree(position).query(position, k=2)[0][:, 1]
+    h = max(gap * extent(mean[moving]), 2 * float(np.quantile(apart, 0.95)))
     voxels, voxel = np.unique(np.floor(position / h).astype(np.int64), axis=0, return_inverse=True)
     pairs = cKDTree(voxels).query_pairs(1.1, p=np.inf, output_type="ndarray")
     links = sparse.coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(voxels),) * 2)

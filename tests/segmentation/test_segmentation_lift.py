@@ -1,0 +1,140 @@
+"""Masks are carried and lifted: labels of a scene that is known exactly."""
+
+import numpy as np
+import pytest
+import torch
+from analytic_bodies import cameras_around, captured, discs, joined, sphere, spheres_on_table
+
+from physics3d.gaussians.rasterize import rasterize
+from physics3d.gaussians.render import render
+from physics3d.log import Log
+from physics3d.segmentation.lift import contributions, islands, lift, touching
+from physics3d.segmentation.masks import GrabCut
+from physics3d.segmentation.prompts import Prompt, View, carry_masks
+
+CAMERAS = cameras_around(10, 0.4)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return spheres_on_table(np.random.default_rng(0))
+
+
+def true_map(gaussians, truth, camera):
+    """Label of the part that contributes most to each pixel."""
+    one_hot = torch.nn.functional.one_hot(truth, 3).float()
+    shape = gaussians.covariance()
+    drawn = rasterize(gaussians.mean, shape, gaussians.opacity, one_hot, camera, background=(1.0, 0.0, 0.0))
+    return drawn.color.argmax(-1)
+
+
+def weighted_overlap(found, true, weight) -> float:
+    return float((weight * (found & true)).sum() / (weight * (found | true)).sum())
+
+
+def test_exact_masks_give_back_the_labels(scene):
+    gaussians, truth, opacity = scene
+    maps = [true_map(gaussians, truth, c) for c in CAMERAS]
+    label = lift(gaussians.mean, contributions(gaussians, CAMERAS, maps, 3))
+    seen = gaussians.mean[:, 2] > -0.038  # the undersides, near the table, show in no camera
+    for k in (1, 2):
+        assert weighted_overlap((label == k) & seen, (truth == k) & seen, opacity) > 0.97
+
+
+def test_the_label_is_that_of_the_larger_contribution():
+    weights = torch.tensor([[5.0, 1.0], [1.0, 1.2], [0.0, 0.0], [0.0, 0.0]])
+    mean = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [0.1, 0, 0], [0.9, 0, 0]])
+    # the last two show nowhere; with two known ones, both vote and ties go to static
+    assert lift(mean, weights)[:2].tolist() == [0, 1]
+    with pytest.raises(ValueError, match="no Gaussian contributes"):
+        lift(mean, torch.zeros(4, 2))
+
+
+def test_hidden_gaussians_take_the_label_of_their_neighbours(scene):
+    gaussians, truth, _ = scene
+    rng = np.random.default_rng(1)
+    core, _ = sphere(50, 0.03, rng)
+    core[:, 2] = np.abs(core[:, 2])  # below, the nearest Gaussians that show are those of the table
+    hidden = discs(core - np.array([0.06, 0, 0]), core / 0.03, rng, sigma=0.0005)
+    both = joined(gaussians, hidden)
+    maps = [true_map(gaussians, truth, c) for c in CAMERAS]
+    weights = contributions(both, CAMERAS, maps, 3)
+    assert float(weights[-50:].sum(1).max()) < 0.3
+    assert (lift(both.mean, weights)[-50:] == 1).all()
+
+
+def test_contributions_add_up_to_opaque_pixels(scene):
+    gaussians, truth, _ = scene
+    camera = CAMERAS[0]
+    total = contributions(gaussians, [camera], [true_map(gaussians, truth, camera)], 3).sum()
+    alpha = render(gaussians, camera, background=(0.0, 0.0, 0.0)).alpha.sum()
+    # float32 sums over ten thousand Gaussians
+    assert float(total) == pytest.approx(float(alpha), rel=1e-3)
+
+
+def views(gaussians):
+    capture = captured(gaussians, CAMERAS)
+    return [
+        View(i, n, im.numpy(), c, render(gaussians, c, background=(1.0, 1.0, 1.0)))
+        for i, (n, im, c) in enumerate(zip(capture.names, capture.images, CAMERAS))
+    ]
+
+
+def test_carried_points_land_on_the_object(scene):
+    gaussians, truth, _ = scene
+    first, *others = views(gaussians)
+    inside = first.points((true_map(gaussians, truth, first.camera) == 1).numpy())
+    for view in others:
+        uv, seen = view.sees(inside)
+        u, v = np.floor(uv[seen]).astype(int).T
+        on = true_map(gaussians, truth, view.camera)[v, u] == 1
+        # pixels of the outline blend two depths, and are a tenth of all
+        assert not seen.any() or float(on.float().mean()) > 0.85
+    # the red ball is in front seen from view 5, and hides most of what view 0 sees of it
+    assert others[4].sees(inside)[1].mean() < 0.3
+
+
+def test_a_mask_reaches_the_far_side(scene):
+    gaussians, truth, _ = scene
+    first, *others = views(gaussians)
+    mask = (true_map(gaussians, truth, first.camera) == 1).numpy()
+    masks = carry_masks(first, mask, [first, *others], GrabCut(), log=Log(None))
+    assert len(masks) >= 9
+    for view in others:
+        true = (true_map(gaussians, truth, view.camera) == 1).numpy()
+        if view.index in masks:
+            found = masks[view.index]
+            assert (found & true).sum() / (found | true).sum() > 0.8, view.name
+
+
+def test_islands_are_the_small_clusters_apart():
+    rng = np.random.default_rng(0)
+    large, small, near = sphere(1000, 0.05, rng)[0], rng.normal(0, 0.001, (20, 3)) + 0.5, np.array([[0.052, 0, 0]])
+    mean = torch.from_numpy(np.concatenate([large, small, near])).float()
+    label = torch.ones(len(mean), dtype=torch.int32)
+    apart = islands(mean, torch.ones(len(mean)), label)
+    assert apart[1000:1020].all() and not apart[1020] and not apart[:1000].any()
+    assert not islands(mean, torch.ones(len(mean)), 0 * label).any()
+
+
+def test_touching_gaussians_are_those_next_to_static_ones():
+    x = torch.linspace(0, 1, 401)
+    mean = torch.stack([x, 0 * x, 0 * x], 1)
+    found = touching(mean, torch.ones(401), (x > 0.5).to(torch.int32))
+    assert found.any() and float(x[found].max()) < 0.53 and not found[x <= 0.5].any()
+
+
+@pytest.mark.parametrize(
+    ("prompt", "remedy"),
+    [
+        ({"positive": ((1.2, 0.5),)}, "is outside the image; give fractions"),
+        ({"box": (10, 20, 200, 300)}, "as fractions of width and height"),
+        ({"box": (0.6, 0.1, 0.3, 0.9)}, "left < right"),
+        ({"lower": (0, 0, 0)}, "both lower and upper"),
+        ({"lower": (0, 0, 1), "upper": (1, 1, 0)}, "below upper"),
+        ({}, "give positive points, a box, or"),
+    ],
+)
+def test_a_prompt_that_cannot_be_is_refused(prompt, remedy):
+    with pytest.raises(ValueError, match=remedy):
+        Prompt(**prompt).check()
