@@ -65,15 +65,13 @@ def scatter(p, adjoint=None):
     inputs = [0, DX, window(), clock, wp.zeros(1, dtype=int, device="cpu")]
     inputs += [array(p["mass"], real), array(p["volume"], real), array(p["cell"], wp.vec3i), array(p["offset"], vec3)]
     inputs += [array(p["u"], vec3), array(p["v"], vec3), array(p["L"], mat33), array(p["tau"], mat33)]
-    kernel = transfer.scatter(real)
     if adjoint is None:
-        wp.launch(kernel, N, inputs=inputs, outputs=[grid, lost], device="cpu")
+        wp.launch(transfer.scatter(real), N, inputs=inputs, outputs=[grid, lost], device="cpu")
         return wp.to_torch(grid), int(lost.numpy()[0])
-    found = [wp.zeros_like(value) for value in inputs[-4:]]
-    wp.launch(
-        kernel, N, inputs=inputs, outputs=[grid, lost], adj_inputs=[*[None] * 9, *found],
-        adj_outputs=[array(adjoint, vec4), None], adjoint=True, device="cpu",
-    )  # fmt: skip
+    offset, *found = [wp.zeros_like(value) for value in inputs[-5:]]
+    inputs.append(array(adjoint, vec4))
+    wp.launch(transfer.scatter_adjoint(real), N, inputs=inputs, outputs=[offset, *found], device="cpu")
+    torch.testing.assert_close(wp.to_torch(offset), wp.to_torch(found[0]) * DX)  # x in cells is offset + u/dx
     return [wp.to_torch(value) for value in found]
 
 
@@ -88,11 +86,10 @@ def gather(p, node_velocity, adjoint=None):
     if adjoint is None:
         wp.launch(transfer.gather(real), N, inputs=inputs, outputs=outputs, device="cpu")
         return [wp.to_torch(value) for value in outputs]
-    found = [wp.zeros_like(value) for value in inputs[-2:]]
-    wp.launch(
-        transfer.gather(real), N, inputs=inputs, outputs=outputs, adj_inputs=[*[None] * 5, *found],
-        adj_outputs=[array(adjoint[0], vec3), array(adjoint[1], mat33)], adjoint=True, device="cpu",
-    )  # fmt: skip
+    offset, *found = [wp.zeros_like(value) for value in inputs[-3:]]
+    inputs += [array(adjoint[0], vec3), array(adjoint[1], mat33)]
+    wp.launch(transfer.gather_adjoint(real), N, inputs=inputs, outputs=[offset, *found], device="cpu")
+    torch.testing.assert_close(wp.to_torch(offset), wp.to_torch(found[0]) * DX)
     return [wp.to_torch(value) for value in found]
 
 
