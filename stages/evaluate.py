@@ -133,8 +133,8 @@ def matched(name: str, video: Video, take: Take, cameras: tuple[int, ...]) -> li
         clips = [video.frames[i] for i in cameras]
     else:
         raise ValueError(
-            f"video {name} has {len(video.frames)} cameras, take {take.name} {len(take.cameras)} of which {len(cameras)} "
-            "are to be evaluated; render those cameras"
+            f"video {name} has {len(video.frames)} cameras, take {take.name} {len(take.cameras)} of which "
+            f"{len(cameras)} are to be evaluated; render those cameras"
         )
     if abs(video.fps / take.fps - 1) > 0.01:
         raise ValueError(

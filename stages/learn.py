@@ -225,7 +225,7 @@ def curves(capture: Capture, history: dict[str, list[float]]):
         if name in capture.truth:
             axis.axhline(capture.truth[name], ls="--", color="0.4", label="truth")
             axis.legend(frameon=False)
-        if min(history[name]) > 0 and name != "poissons_ratio":
+        if max(history[name]) > 5 * min(history[name]) > 0:
             axis.set_yscale("log")
         axis.set(title=name, xlabel="step")
     return figure

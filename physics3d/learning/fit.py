@@ -181,5 +181,5 @@ def draw_frames(chain: Chain, count: int, generator: torch.Generator) -> Tensor:
     total = len(next(iter(chain.clips.values())))
     if not 0 < count < total:
         return torch.arange(total)
-    edges = torch.linspace(1, total, count + 1)  # frame 0 is the same for every material
-    return (edges[:-1] + (edges[1:] - edges[:-1]) * torch.rand(count, generator=generator)).floor().long()
+    edges = torch.linspace(1, total, count + 1).floor()  # frame 0 is the same for every material
+    return (edges[:-1] + (edges.diff() * torch.rand(count, generator=generator)).floor()).long()

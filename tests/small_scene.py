@@ -92,6 +92,12 @@ def capture(truth: dict[str, float], *, frames: int = 10, fps: float = 20.0, vie
         videos = [chain.render(motion, view, torch.arange(frames)) for view in range(views)]
     videos = tuple((v.clamp(0, 1) * 255).round().to(torch.uint8) for v in videos)
     take = Take(
-        name="poke", role="learn", fps=fps, cameras=cameras(views), videos=videos, excitation=POKE, held_out_cameras=held_out
+        name="poke",
+        role="learn",
+        fps=fps,
+        cameras=cameras(views),
+        videos=videos,
+        excitation=POKE,
+        held_out_cameras=held_out,
     )
     return Capture(name="bar", images=(), cameras=(), names=(), gaussians=gaussians, takes=(take,), truth=truth)

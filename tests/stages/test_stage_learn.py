@@ -1,0 +1,106 @@
+"""The learn stage on a clip rendered by the same code: what was put in comes out."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from small_scene import ELASTIC, bar, capture, learner
+
+from physics3d.log import Log
+from physics3d.mpm.world import Estimate
+
+START = ELASTIC | {"youngs_modulus": 7e3}
+
+
+@pytest.fixture(scope="module")
+def clip():
+    return capture(ELASTIC)
+
+
+def test_stiffness_is_recovered_and_documented(clip, tmp_path):
+    """From a third of the truth. 5 %: ten 8-bit pictures of 48 x 40 px, six steps, no search node at the truth."""
+    stage = learner(START, ("youngs_modulus",), search=4, search_span=8.0, steps=6)
+    estimate = stage(clip, *bar(), log=Log(tmp_path, quiet=True))
+    assert float(estimate.parameters["youngs_modulus"]) == pytest.approx(2e4, rel=0.05)
+    assert float(estimate.parameters["poissons_ratio"]) == pytest.approx(0.3)
+    assert len(estimate.history["youngs_modulus"]) == len(estimate.history["loss"]) == 6
+    for preview in ("parameters", "reference_above_learned"):
+        assert (tmp_path / "previews" / f"{preview}.png").stat().st_size > 1000
+    text = (tmp_path / "metrics.jsonl").read_text()
+    assert all(
+        name in text
+        for name in ("parameter/youngs_modulus", "sensitivity/youngs_modulus", "search/loss", "loss_learned")
+    )
+    estimate.save(tmp_path / "estimate")
+    assert Estimate.load(tmp_path / "estimate").history == estimate.history
+
+
+def test_initial_velocity_moves_towards_the_truth(clip):
+    """The clip starts at rest; learning that begins with a throw has to slow it down."""
+    gaussians, body = bar()
+    stage = learner(ELASTIC, ("youngs_modulus",), learn_velocity=True, steps=3, frames=3, duration=0.1)
+    thrown = replace(stage.world.estimate(), velocity=torch.tensor([0.5, 0.0, 0.0]))
+    stage = replace(stage, world=_Thrown(stage.world, thrown))
+    estimate = stage(clip, gaussians, body, log=Log(None))
+    assert float(estimate.velocity[0]) < 0.35
+
+
+class _Thrown:
+    """A world whose estimate starts with a velocity."""
+
+    def __init__(self, world, estimate):
+        self._world, self._estimate = world, estimate
+
+    def estimate(self):
+        return self._estimate
+
+    def __getattr__(self, name):
+        return getattr(self._world, name)
+
+
+def test_held_out_cameras_are_never_looked_at():
+    clean = capture(ELASTIC, frames=3, views=2, held_out=(1,))
+    take = clean.takes[0]
+    spoiled = replace(clean, takes=(replace(take, videos=(take.videos[0], 255 - take.videos[1])),))
+    stage = learner(START, ("youngs_modulus",), frames=3, steps=1, views_per_step=0)
+    found = [stage(c, *bar(), log=Log(None)).history for c in (clean, spoiled)]
+    assert found[0] == found[1]
+
+
+def test_no_steps_no_search_leaves_the_start(clip):
+    estimate = learner(START, ("youngs_modulus",), steps=0)(clip, *bar(), log=Log(None))
+    assert float(estimate.parameters["youngs_modulus"]) == pytest.approx(7e3)
+
+
+def test_frames_span_the_duration(clip):
+    stage = learner(START, ("youngs_modulus",), frames=4)
+    assert stage.indices(clip.takes[0]).tolist() == [0, 3, 6, 9]
+    assert replace(stage, duration=0.2, frames=3).indices(clip.takes[0]).tolist() == [0, 2, 4]
+
+
+@pytest.mark.parametrize(
+    "change, word",
+    [
+        ({"frames": 11}, "has 10 frames"),
+        ({"frames": 9, "duration": 0.2}, "raise learn.duration"),
+        ({"learn": ("stiffness",)}, "youngs_modulus"),
+        ({"learn": ("poissons_ratio",), "search": 3}, "no modulus"),
+    ],
+)
+def test_what_does_not_fit_the_take_is_refused(clip, change, word):
+    stage = replace(learner(START, ("youngs_modulus",)), **change)
+    with pytest.raises(ValueError, match=word):
+        stage(clip, *bar(), log=Log(None))
+
+
+@pytest.mark.parametrize(
+    "change", [{"frames": 1}, {"learning_rate": 0.0}, {"search_span": 1.0}, {"steps": -1}, {"stay": -1.0}]
+)
+def test_impossible_options_are_refused(change):
+    with pytest.raises(ValueError, match=f"learn.{next(iter(change))}"):
+        replace(learner(START, ("youngs_modulus",)), **change)
+
+
+def test_a_capture_without_a_take_is_refused(clip):
+    with pytest.raises(ValueError, match="no take with role learn"):
+        learner(START, ("youngs_modulus",))(replace(clip, takes=()), *bar(), log=Log(None))
