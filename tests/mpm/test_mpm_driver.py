@@ -1,4 +1,4 @@
-"""Known answers of the viscoelastic model on the test machine without a grid (docs/method.md, section 5, 1 to 5)."""
+"""Known answers on the test machine without a grid (docs/method.md, section 5, 1 to 5; yield, friction, viscosity)."""
 
 import itertools
 import math
@@ -7,8 +7,11 @@ import pytest
 import torch
 
 from physics3d.mpm import driver
+from physics3d.mpm.materials.drucker_prager import DruckerPrager
 from physics3d.mpm.materials.neo_hookean import NeoHookean
+from physics3d.mpm.materials.newtonian import Newtonian
 from physics3d.mpm.materials.viscoelastic import Viscoelastic
+from physics3d.mpm.materials.von_mises import VonMises
 
 ONE = torch.eye(3, dtype=torch.float64)
 BRANCH = Viscoelastic(elastic=False)
@@ -146,6 +149,45 @@ def test_tension_is_differentiable_with_respect_to_the_material():
 
     point = [torch.tensor(x, dtype=torch.float64, requires_grad=True) for x in (2.0, 1.0, 0.7)]
     assert torch.autograd.gradcheck(last, point, eps=1e-5, atol=1e-7, rtol=1e-6)
+
+
+def test_metal_in_tension_hardens_along_the_given_line():
+    """Beyond yield tau_11 = sigma_y + h alpha, and ln stretch = tau_11/E + alpha (Hencky elasticity)."""
+    E, sigma_y, h = 1e6, 2e4, 1e5
+    stretch = torch.linspace(1, 1.2, 21, dtype=torch.float64)
+    values = numbers(youngs_modulus=E, poissons_ratio=0.3, yield_stress=sigma_y, hardening_modulus=h)
+    tau, _ = driver.uniaxial(VonMises(), values, torch.arange(21, dtype=torch.float64), stretch)
+    strain = stretch.log()
+    expected = torch.minimum(E * strain, (sigma_y + h * strain) / (1 + h / E))
+    # proportional loading: radial return is exact; the sides are free to 1e-12 of the stiffness
+    torch.testing.assert_close(tau, expected, rtol=1e-9, atol=1e-4)
+
+
+def test_sand_shears_at_its_friction_angle_and_bears_no_tension():
+    phi = 0.6
+    a = math.sqrt(2 / 3) * 2 * math.sin(phi) / (3 - math.sin(phi))
+    values = numbers(youngs_modulus=1e6, poissons_ratio=0.3, friction_angle=phi)
+    squeeze, shear = 0.99 * ONE, torch.linspace(0, 0.2, 20, dtype=torch.float64)
+    F = torch.cat([ONE[None], squeeze.repeat(len(shear), 1, 1)])
+    F[1:, 0, 1] = shear
+    tau = driver.prescribed(DruckerPrager(), values, torch.arange(len(F), dtype=torch.float64), F)[-1]
+    assert deviator(tau).norm().item() == pytest.approx(-a * tau.trace().item(), rel=1e-12)
+    # pulled apart it is free, pushed back to its first volume it is free still, and pressed further it resists
+    path = torch.stack([size * ONE for size in (1.0, 1.02, 1.05, 1.02, 1.0, 0.99)])
+    tau = driver.prescribed(DruckerPrager(), values, torch.arange(6, dtype=torch.float64), path)
+    pressure = -tau.diagonal(dim1=-2, dim2=-1).mean(-1)
+    torch.testing.assert_close(pressure[:5], torch.zeros(5, dtype=torch.float64), rtol=0, atol=1e-6)
+    assert pressure[5].item() == pytest.approx(-3 * math.log(0.99) * 1e6 / (3 * (1 - 0.6)), rel=1e-9)
+
+
+@pytest.mark.parametrize("n", [1.0, 0.5])
+def test_fluid_in_shear_has_its_viscosity(n):
+    rate, k = 4.0, 3.0
+    time = torch.linspace(0, 1, 11, dtype=torch.float64)
+    values = numbers(bulk_modulus=1e5, viscosity=k, power_index=n)
+    tau = driver.simple_shear(Newtonian(), values, time, rate * time)[-1]
+    assert tau[0, 1].item() == pytest.approx(k * rate**n, rel=1e-6)  # (g_0/g)^2 of the regularisation
+    assert tau.diagonal().abs().max() < 1e-6
 
 
 def test_tables_that_cannot_be_right_are_refused():

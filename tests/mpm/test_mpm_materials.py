@@ -10,6 +10,7 @@ import torch
 
 from physics3d.mpm import driver, materials
 from physics3d.mpm.materials.base import AbstractMaterial
+from physics3d.mpm.materials.neo_hookean import NeoHookean
 from physics3d.mpm.materials.viscoelastic import Viscoelastic
 
 ONE = torch.eye(3, dtype=torch.float64)
@@ -111,22 +112,26 @@ def test_stress_rotates_with_the_body_and_forgets_the_rotation_before(material, 
     torch.testing.assert_close(tau, tau.mT, rtol=0, atol=round_off)
 
 
-def test_stress_is_the_derivative_of_the_stored_energy(material, rng):
+@pytest.mark.parametrize("size", [1e-6, 0.3])
+def test_stress_is_the_derivative_of_the_stored_energy(material, size, rng):
+    """Where nothing flows: for sand and metal, that is under slight compression and far inside the yield surface."""
+    if size > 0.1 and not isinstance(material, (NeoHookean, Viscoelastic)):
+        pytest.skip("flows at large strain")
     n = 6
-    # sand bears no tension and metal yields early: look inside the yield surface, under slight compression
-    M = -1e-4 * ONE + 1e-6 * random(rng, n, 3, 3) if material.plastic else 0.3 * random(rng, n, 3, 3)
+    M = size * random(rng, n, 3, 3) - (1e-4 * ONE if size < 0.1 else 0)
     _, H, memory = walk(material, torch.zeros_like(M), [M])
     c = coefficients(material, n)
     _, tau, _ = driver.advance(material, 0.0, torch.zeros_like(M), H, c, memory)
-    A, step, instant = random(rng, n, 3, 3), (1e-7 if material.plastic else 1e-5), 1e-15
+    A, step, instant = random(rng, n, 3, 3), min(1e-5, size), 1e-15
 
     def energy(sign):
         H_next, _, memory_next = driver.advance(material, instant, sign * step / instant * A, H, c, memory)
         return material.energy(c, H_next, memory_next)
 
     power = (energy(1) - energy(-1)) / (2 * step)
-    # central differences: step^2, and round-off of an energy of the order of the stiffness over the step
-    torch.testing.assert_close((tau * A).sum((1, 2)), power, rtol=1e-5, atol=1e-7 * tau.abs().max().item())
+    # central differences: step^2, and round-off 1e-16 of the stiffness over the step, which is 1e-6 of the small stress
+    accuracy = 1e-7 if size > 0.1 else 1e-5
+    torch.testing.assert_close((tau * A).sum((1, 2)), power, rtol=1e-5, atol=accuracy * tau.abs().max().item())
 
 
 def test_no_energy_from_nothing(material, rng):

@@ -119,14 +119,12 @@ class Viscoelastic(base.AbstractMaterial):
             psi = psi + mu * ((s - 1) ** 2).sum(1) + lam / 2 * (torch.linalg.det(F) - 1) ** 2
         for i in range(self.branches):
             mu, K = coefficients[self._first(i) : self._first(i) + 2]
-            X = memory[6 * i : 6 * i + 6][[0, 1, 2, 1, 3, 4, 2, 4, 5]].T.reshape(-1, 3, 3)
-            log_b = torch.log(torch.linalg.eigvalsh(one + X))
-            log_J = log_b.sum(1) / 2
-            log_dev = log_b - log_b.mean(1, keepdim=True)
+            strain = memory[6 * i : 6 * i + 6]
             if self.spring == "hencky":
-                psi = psi + mu / 4 * (log_dev**2).sum(1) + K / 2 * log_J**2
+                psi = psi + base.hencky_energy(mu, K, strain)
             else:
-                psi = psi + mu / 2 * torch.expm1(log_dev).sum(1) + K / 2 * log_J**2
+                dev, log_J = base.log_strain(strain)
+                psi = psi + mu / 2 * torch.expm1(2 * dev).sum(1) + K / 2 * log_J**2
         return psi
 
     def advance(self, real: type) -> wp.Function:
@@ -181,6 +179,7 @@ def _advance(branches: int, elastic: bool, spring: str, real: type) -> wp.Functi
     mat33 = spectral.matrix_type(real)
     volume_change, stretch = spectral.volume_change(real), spectral.stretch(real)
     maxwell = _RELAX[spring](real)
+    carried, store = base.carried_strain(real), base.store_strain(real)
     key = f"{branches}_{'elastic' if elastic else 'viscous'}_{spring}_{real.__name__}"
     first = 2 if elastic else 0
 
@@ -189,12 +188,6 @@ def _advance(branches: int, elastic: bool, spring: str, real: type) -> wp.Functi
         Y = stretch(H)
         j = volume_change(H)
         return real(2.0) * mu * (Y + Y * Y) + lam * (real(1.0) + j) * j * wp.identity(n=3, dtype=real)
-
-    @wp.func(name=f"stored_strain_{real.__name__}")
-    def stored(p: int, row: int, memory: wp.array2d(dtype=real)):
-        xx, xy, xz = memory[row, p], memory[row + 1, p], memory[row + 2, p]
-        yy, yz, zz = memory[row + 3, p], memory[row + 4, p], memory[row + 5, p]
-        return mat33(xx, xy, xz, xy, yy, yz, xz, yz, zz)
 
     @wp.func(name=f"viscoelastic_{key}")
     def advance(
@@ -213,23 +206,11 @@ def _advance(branches: int, elastic: bool, spring: str, real: type) -> wp.Functi
             tau = tau + corotated(H_next, coefficients[0, p], coefficients[1, p])
         # unrolled, and flat: each nested function would be evaluated once more in the adjoint
         for i in range(wp.static(branches)):
-            X = stored(p, 6 * i, memory)
-            N = M + M * X
             k = first + 4 * i
-            tau_N, X_next = maxwell(
-                X + N + wp.transpose(N) + N * wp.transpose(M),
-                coefficients[k, p],
-                coefficients[k + 1, p],
-                dt * coefficients[k + 2, p],
-                dt * coefficients[k + 3, p],
-            )
+            d, v = dt * coefficients[k + 2, p], dt * coefficients[k + 3, p]
+            tau_N, X = maxwell(carried(p, 6 * i, M, memory), coefficients[k, p], coefficients[k + 1, p], d, v)
+            store(p, 6 * i, X, memory_next)
             tau = tau + tau_N
-            memory_next[6 * i, p] = X_next[0, 0]
-            memory_next[6 * i + 1, p] = X_next[0, 1]
-            memory_next[6 * i + 2, p] = X_next[0, 2]
-            memory_next[6 * i + 3, p] = X_next[1, 1]
-            memory_next[6 * i + 4, p] = X_next[1, 2]
-            memory_next[6 * i + 5, p] = X_next[2, 2]
         return H_next, tau
 
     return advance
