@@ -55,5 +55,5 @@ def test_adding_gaussians_keeps_the_picture_and_reaches_the_wanted_count():
     assert len(grown) == len(moments["mean"][0]) == 150
     assert (grown.opacity > 0.02).all()  # the faded ones are gone
     before, after = (render(g, photographs[0].camera, background=black).color for g in (start, grown))
-    # 50 of 100 are split; their halves cover 2 x 0.6 x 0.85 to 2 x 0.85^2 times the parent's area; copies would give 0.5
+    # 50 of 100 are split; their halves cover 2 x 0.6 x 0.85 to 2 x 0.85^2 times the parent's area; copies give 0.5
     assert (after - before).abs().mean() < 0.25 * before.mean()
