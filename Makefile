@@ -40,11 +40,11 @@ run: $(ready) ## the pipeline on SCENE; what has been computed before is reused
 ui: $(ready) ## MLflow: prints the address of the page that compares runs, and serves it
 	@PORT=$(PORT) $(py) -m pipeline.tracking .
 
-view: ## the newest video and previews of SCENE's last run
-	@newest=$$(ls -td artifacts/render/*/ 2>/dev/null | head -1); \
-	test -n "$$newest" || { echo 'error: nothing rendered yet; make run SCENE=$(SCENE)'; exit 1; }; \
-	ls -d "$$newest"*.mp4 "$$newest"previews/*; \
-	if [ -n "$$DISPLAY$$WAYLAND_DISPLAY" ] && command -v xdg-open >/dev/null; then xdg-open "$$(ls "$$newest"*.mp4 | head -1)"; fi
+view: ## the video and previews of the last run
+	@folder=$$(cat artifacts/.latest 2>/dev/null); \
+	test -d "$$folder" || { echo 'error: nothing rendered yet; make run SCENE=$(SCENE)'; exit 1; }; \
+	ls -d "$$folder"/*.mp4 "$$folder"/previews/*; \
+	if [ -n "$$DISPLAY$$WAYLAND_DISPLAY" ] && command -v xdg-open >/dev/null; then xdg-open "$$(ls "$$folder"/*.mp4 | head -1)"; fi
 
 test: $(ready) ## everything that needs no GPU and no weights
 	@OMP_NUM_THREADS=1 $(py) -m pytest -n 2 --dist loadfile $(ARGS)

@@ -1,8 +1,8 @@
 """An artifact is a frozen dataclass that saves, loads and checks itself.
 
-Tensors and arrays go to `arrays.safetensors`, everything else to `fields.json`; nothing is pickled, so that loading runs
-no foreign code and a person can read what was stored. Dataclasses of this project may be nested to any depth in
-tuples, lists and dicts. The pipeline files the folder atomically (`pipeline/stage.py`); here nothing knows about caching.
+Tensors and arrays go to `arrays.safetensors`, everything else to `fields.json`; nothing is pickled, so that loading
+runs no foreign code and a person can read what was stored. Dataclasses of this project may be nested to any depth in
+tuples, lists and dicts. Whoever calls `save` may file the folder atomically; here nothing knows about caching.
 """
 
 import dataclasses
@@ -31,12 +31,15 @@ class AbstractArtifact:
         """Raise ValueError naming field, value and remedy if the contents cannot be right."""
 
     def save(self, folder: Path) -> None:
-        """Write the artifact into `folder` (made if missing). Raises ValueError from `check`, OSError on a full disk."""
+        """Write the artifact into `folder`, made if missing. Raises ValueError from `check`, OSError on a full disk."""
         self.check()
         folder.mkdir(parents=True, exist_ok=True)
         tensors: dict[str, torch.Tensor] = {}
         tree = _encode(self, "", tensors)
-        save_file(tensors, folder / ARRAYS)
+        try:
+            save_file(tensors, folder / ARRAYS)
+        except SafetensorError as error:
+            raise OSError(f"cannot write {folder / ARRAYS}: {error}") from error
         (folder / FIELDS).write_text(json.dumps(tree, indent=1))
 
     @classmethod
@@ -48,10 +51,13 @@ class AbstractArtifact:
                 tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118
         except (OSError, json.JSONDecodeError, SafetensorError) as error:
             raise ArtifactError(f"{folder} does not hold a readable {cls.__name__}: {error}") from error
-        artifact = _decode(tree, tensors)
-        if not isinstance(artifact, cls):
-            raise ArtifactError(f"{folder} holds a {type(artifact).__name__}, expected {cls.__name__}")
-        artifact.check()
+        try:
+            artifact = _decode(tree, tensors)
+            if not isinstance(artifact, cls):
+                raise ArtifactError(f"it holds a {type(artifact).__name__}")
+            artifact.check()
+        except (ValueError, KeyError, TypeError, AttributeError, ImportError) as error:
+            raise ArtifactError(f"{folder} does not hold a valid {cls.__name__}: {error}") from error
         return artifact
 
 

@@ -2,6 +2,7 @@
 
 import math
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,10 @@ from pipeline.stage import Step, manifest, peek
 
 
 def report(plan: Plan, hits: dict[str, bool]) -> dict[str, float]:
-    """Print the tables; `hits` says which steps were reused. Returns the headline numbers by name, for tracking."""
+    """Print the tables; `hits` says which steps were reused. Returns the headline numbers by name, for tracking.
+
+    The folder of the video is noted in artifacts/.latest, where `make view` looks.
+    """
     from rich import box
     from rich.console import Console
     from rich.table import Table
@@ -64,6 +68,8 @@ def report(plan: Plan, hits: dict[str, bool]) -> dict[str, float]:
 
     for video in sorted(steps["render"].folder.glob("*.mp4")):
         console.print(f"video     {_near(video)}", markup=False)
+    with suppress(OSError):
+        (steps["render"].shelf / ".latest").write_text(str(steps["render"].folder) + "\n")
     console.print(f"previews  {_near(steps['render'].folder / 'previews')}   (make view)", markup=False)
     return headline
 
