@@ -9,6 +9,7 @@ import torch
 from physics3d.gaussians.cameras import Camera
 from physics3d.log import Log
 from physics3d.metrics.scores import Scores
+from physics3d.mpm.boundaries.impulse import Impulse
 from physics3d.mpm.world import Estimate
 from physics3d.scenes.base import Capture, Take
 from physics3d.video import Video
@@ -102,10 +103,13 @@ def test_a_larger_reference_is_averaged_down_and_a_longer_one_cut():
 
 
 def test_videos_that_show_another_excitation_are_marked():
-    scores = Evaluate(comparable=False, note="other force")(
-        capture(swing(1.5)), {"learned": video(swing(1.4))}, {}, log=Log(None)
-    )
-    assert not scores.comparable and scores.notes["comparison"] == "other force"
+    poke = Impulse(force=(1.0, 0.0, 0.0), centre=(0.0, 0.0, 0.0), radius=0.1, start=0.0, duration=0.1)
+    reference = capture(swing(1.5))
+    reference = replace(reference, takes=(replace(reference.takes[0], excitation=(poke,)),))
+    for force, alike in (({"x": 1.0, "y": 0.0, "z": 0.0}, True), ({"x": 0.0, "y": 1.0, "z": 0.0}, False)):
+        stage = Evaluate(excitation=(poke,), force=force)
+        scores = stage(reference, {"learned": video(swing(1.4))}, {}, log=Log(None))
+        assert scores.comparable == alike and ("comparison" in scores.notes) != alike
 
 
 def test_what_cannot_be_compared_is_refused():
