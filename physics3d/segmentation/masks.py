@@ -42,30 +42,34 @@ class GrabCut(AbstractMasker):
         import cv2
 
         height, width = image.shape[:2]
+        kinds = np.zeros((height, width), np.uint8)
         if box is None:
             # nothing but points: the object is what resembles their neighbourhood
-            guess = np.full((height, width), cv2.GC_PR_BGD, np.uint8)
+            kinds[:] = cv2.GC_PR_BGD
             reach = max(2, round(0.03 * max(height, width)))
+            near = slice(0, height), slice(0, width)
         else:
             left, top, right, bottom = np.round(np.clip(box, 0, [width, height, width, height])).astype(int)
             if right - left < 3 or bottom - top < 3:
                 return np.zeros((height, width), bool)
-            guess = np.full((height, width), cv2.GC_BGD, np.uint8)
-            guess[top:bottom, left:right] = cv2.GC_PR_FGD
+            kinds[:] = cv2.GC_BGD
+            kinds[top:bottom, left:right] = cv2.GC_PR_FGD
             reach = max(1, round(0.004 * max(height, width)))
+            # the surroundings are what lies near the box: sharper colour models, and fewer pixels to cut
+            du, dv = (right - left) // 2, (bottom - top) // 2
+            near = slice(max(0, top - dv), bottom + dv), slice(max(0, left - du), right + du)
         for points, value in ((positive, cv2.GC_FGD), (negative, cv2.GC_BGD)):
             for u, v in np.floor(points).astype(int).tolist():
-                cv2.circle(guess, (u, v), reach, value, -1)
-        kinds = np.isin(guess, (cv2.GC_FGD, cv2.GC_PR_FGD))
-        if not kinds.any():
-            return kinds
-        if not kinds.all():  # a box as large as the image leaves nothing to learn the surroundings from
+                cv2.circle(kinds, (u, v), reach, value, -1)
+        guess = kinds[near].copy()
+        is_object = lambda: np.isin(guess, (cv2.GC_FGD, cv2.GC_PR_FGD))
+        # without any object or any surroundings there is no colour model to learn
+        if is_object().any() and not is_object().all():
             cv2.setRNGSeed(0)
-            models = np.zeros((1, 65)), np.zeros((1, 65))
-            cv2.grabCut(
-                np.ascontiguousarray(image[..., ::-1]), guess, None, *models, self.iterations, cv2.GC_INIT_WITH_MASK
-            )
-        mask = np.isin(guess, (cv2.GC_FGD, cv2.GC_PR_FGD)).astype(np.uint8)
+            models, pixels = (np.zeros((1, 65)), np.zeros((1, 65))), np.ascontiguousarray(image[near][..., ::-1])
+            cv2.grabCut(pixels, guess, None, *models, self.iterations, cv2.GC_INIT_WITH_MASK)
+        mask = np.zeros((height, width), np.uint8)
+        mask[near] = is_object()
         closed = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
         return connected_to(closed.astype(bool), positive)
 
