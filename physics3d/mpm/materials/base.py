@@ -9,7 +9,6 @@ import abc
 import functools
 import math
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 import warp as wp
@@ -24,8 +23,6 @@ Values = dict[str, Tensor]  # physical name -> scalar or one number per particle
 @dataclass(frozen=True, kw_only=True)
 class AbstractMaterial(abc.ABC):
     """A constitutive model. Its fields choose the model; its parameters are the numbers that one learns."""
-
-    plastic: ClassVar[bool] = False  # True: H is elastic only, the solver keeps the total deformation beside it
 
     @property
     @abc.abstractmethod
@@ -113,7 +110,8 @@ def store_strain(real: type) -> wp.Function:
 def log_strain(memory: Float[Tensor, "6 n"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
     """Stored strain -> (principal values of dev ln V, ln J)."""
     X = memory[[0, 1, 2, 1, 3, 4, 2, 4, 5]].T.reshape(-1, 3, 3)
-    log_stretch = torch.log1p(torch.linalg.eigvalsh(X)) / 2
+    # on the CPU: cusolver refuses batches of a hundred thousand small matrices
+    log_stretch = torch.log1p(torch.linalg.eigvalsh(X.cpu())).to(X.device) / 2
     return log_stretch - log_stretch.mean(1, keepdim=True), log_stretch.sum(1)
 
 
