@@ -32,19 +32,19 @@ class BallTwin(AbstractSource):
     gap: float = 0.02  # between ball and floor at rest [m]
     frames: int = 12  # of each take, the rest state included
     fps: float = 48.0  # [1/s]
-    evaluate_force: tuple[float, float, float] = (1.0, 0.0, 0.0)  # on the whole ball in the held-out take [N]
+    evaluate_force: tuple[float, float, float] = (0.4, 0.0, 0.0)  # on the whole ball in the held-out take [N]
     push: float = 0.05  # duration of the push [s]
     # the truth
-    youngs_modulus: float = 2.0e4  # of the elastic branch [Pa]
+    youngs_modulus: float = 6.0e3  # of the elastic branch [Pa]
     poissons_ratio: float = 0.3
-    branch_shear_modulus: float = 4.0e3  # mu_N [Pa]
-    branch_bulk_modulus: float = 8.0e3  # K_N [Pa]
+    branch_shear_modulus: float = 1.2e3  # mu_N [Pa]
+    branch_bulk_modulus: float = 2.0e3  # K_N [Pa]
     shear_viscosity_time: float = 0.05  # 1/k_d [s]
     bulk_viscosity_time: float = 0.05  # 1/k_v [s]
     density: float = 300.0  # [kg/m^3]
     gravity: float = 9.81  # downward [m/s^2]
     # how the reference motion is computed: finer than the pipeline
-    dx: float = 0.011  # cell of the grid [m]
+    dx: float = 0.0125  # cell of the grid [m]
     seed: int = 0
     device: str = "cpu"
 
@@ -54,7 +54,7 @@ class BallTwin(AbstractSource):
     def __call__(self, *, log) -> Capture:
         centre = (0.0, 0.0, RADIUS + self.gap)
         mesh = checkered_ball(centre)
-        light = Light(backdrop=(1.0, 1.0, 1.0))
+        light = Light(sun=(1.0, 0.96, 0.9), backdrop=(1.0, 1.0, 1.0))
         studio = Studio([mesh], light, openness_rays=4, seed=self.seed)
         per_ring = [self.views - 2 * (self.views // 3), self.views // 3, self.views // 3]
         cameras = []
@@ -140,5 +140,5 @@ def checkered_ball(centre: tuple[float, float, float]) -> Mesh:
     dark = (np.floor(polar / np.pi * 8 - 1e-9) + np.floor(around / (2 * np.pi) * 12 + 1e-9)) % 2 == 0
     turn = (0.5 + 0.5 * np.cos(around))[..., None]
     warm, cool = to_linear(np.array((0.85, 0.25, 0.15))), to_linear(np.array((0.15, 0.35, 0.75)))
-    albedo = np.where(dark[..., None], turn * warm + (1 - turn) * cool, to_linear(np.array((0.95, 0.9, 0.75))))
+    albedo = np.where(dark[..., None], turn * warm + (1 - turn) * cool, to_linear(np.array((0.85, 0.75, 0.50))))
     return surface_grid(np.asarray(centre) + RADIUS * unit, albedo, closed_b=True, moves=True)

@@ -102,6 +102,7 @@ class Studio:
             for _ in range(rays):
                 d = rng.normal(size=n.shape).astype(np.float32)
                 d = n + 0.98 * d / np.linalg.norm(d, axis=1, keepdims=True)  # cosine distributed about n
+                d /= np.linalg.norm(d, axis=1, keepdims=True)
                 free += ~pose.blocked(self.vertices + 5 * OFFSET * n, d, reach=0.12)
             open_sides.append(free / rays)
         openness = np.maximum(*open_sides)
@@ -122,8 +123,7 @@ class Pose:
         self._tensor = o3d.core.Tensor
 
     def blocked(self, origin: np.ndarray, direction: np.ndarray, *, reach: float) -> np.ndarray:
-        """Whether something lies between `origin` [n, 3] and origin + reach * direction / |direction|."""
-        direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
+        """Whether something lies between `origin` [n, 3] and origin + reach * direction (unit), `reach` in m."""
         rays = np.concatenate([origin, direction], 1).astype(np.float32)
         return self.scene.test_occlusions(self._tensor(rays), tnear=0.0, tfar=reach).numpy()
 
@@ -136,13 +136,13 @@ class Pose:
         total = np.zeros((h * w, 3), np.float32)
         cover = np.zeros(h * w, np.float32)
         first = np.full((h * w, 3), np.nan, np.float32)
+        eye, through = camera.rays()
+        rays = np.concatenate([np.broadcast_to(eye.numpy(), (h * w, 3)), through.reshape(-1, 3).numpy()], 1)
+        right, down = camera.world_to_camera[:2, :3].float().numpy()
+        origin = rays[:, :3]
         for i, (du, dv) in enumerate(SUPERSAMPLES):
-            shifted = replace(camera, cx=camera.cx - du + 0.5, cy=camera.cy - dv + 0.5)
-            origin, direction = shifted.rays()
-            direction = direction.reshape(-1, 3).numpy()
-            direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
-            origin = np.broadcast_to(origin.numpy(), direction.shape)
-            answer = self.scene.cast_rays(self._tensor(np.concatenate([origin, direction], 1).astype(np.float32)))
+            direction = rays[:, 3:] + ((du - 0.5) / camera.fx * right + (dv - 0.5) / camera.fy * down)
+            answer = self.scene.cast_rays(self._tensor(np.concatenate([origin, direction], 1)))
             distance = answer["t_hit"].numpy()
             hit = np.isfinite(distance)
             point = origin[hit] + distance[hit, None] * direction[hit]
@@ -162,15 +162,16 @@ class Pose:
     def _shade(self, point, direction, face, uv, sun) -> Float32[np.ndarray, "n 3"]:
         studio, light = self.studio, self.studio.light
         corner = studio.faces[face]
-        weight = np.stack([1 - uv.sum(1), uv[:, 0], uv[:, 1]], 1)[..., None].astype(np.float32)
-        normal = (self.normals[corner] * weight).sum(1)
-        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-        normal *= -np.sign((normal * direction).sum(1, keepdims=True) + 1e-9)  # towards the camera
-        albedo = (studio.albedo[corner] * weight).sum(1)
+        u, v = uv[:, :1], uv[:, 1:]
+        vertex = np.concatenate([self.normals, studio.albedo, studio.openness[:, None]], 1)
+        smooth = (1 - u - v) * vertex[corner[:, 0]] + u * vertex[corner[:, 1]] + v * vertex[corner[:, 2]]
+        normal, albedo, openness = smooth[:, :3], smooth[:, 3:6], smooth[:, 6]
+        length = np.sqrt(np.einsum("ni,ni->n", normal, normal))
+        towards = np.where(np.einsum("ni,ni->n", normal, direction) > 0, -1, 1)  # the camera
+        normal *= (towards / np.maximum(length, 1e-9))[:, None].astype(np.float32)
         for owner, paint in studio.paints.items():
             which = studio.owner[face] == owner
             albedo[which] *= paint(point[which])
-        openness = (studio.openness[corner] * weight[..., 0]).sum(1)
         facing = normal @ sun
         lit = np.where(facing > 0, facing, -facing * studio.translucency[face])
         # the ray starts on the lit side; a surface lit from behind does not shade itself
