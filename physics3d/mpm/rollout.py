@@ -2,10 +2,12 @@
 
     rollout(world, parameters, position, volume, ...) -> Trajectory
 
-Time step. Waves cross a cell in dx/(c + |v|), with rho c^2 the wave modulus of the material times the current stretch
-squared; a lone particle, whose stress comes back undiluted, needs dt < dx/(sqrt(3) c) (its three axes act together;
-Sun, Shinar and Schroeder 2020). An automatic substep is cfl times the former and at most 0.95 times the latter. Every
-frame has a whole number of equal substeps; a frame that turns out too fast for its substeps is done again with more.
+Time step. Waves cross a cell in dx/(c + |v|), with rho c^2 = M + 2 |tau|, M the wave modulus at rest: a bound for
+stretched and compressed bodies, where it is M - tau (Hencky), at most M + |tau| (neo-Hookean) or s^2 M at a stretch s
+(fixed corotated). A lone particle, whose stress comes back undiluted, needs dt < dx/(sqrt(3) c): its three axes act
+together (Sun, Shinar and Schroeder 2020). An automatic substep is cfl times the former and at most 0.95 times the
+latter. Every frame has a whole number of equal substeps; a frame that turns out too fast for them is done again with
+more.
 
 Gradients. The exact adjoint of the discrete trajectory: the state is kept at every RUN-th substep, and the reverse pass
 recomputes the substeps in between, run by run, with the same dt and the same windows.
@@ -188,7 +190,7 @@ class _Solver:
             if frame:
                 self._frame(frame, keep)
             now = substeps.state(self.current)
-            u[frame], deformation[frame] = now.u, now.G + eye
+            u[frame], deformation[frame] = now.u, now.H + eye
             for name, value in self._health(now).items():
                 self.health.setdefault(name, []).append(value)
         return u, deformation
@@ -201,7 +203,7 @@ class _Solver:
         states = substeps.adjoint["states"]
         for frame in range(self.frames - 1, 0, -1):
             states[side].u.add_(adjoint_u[frame])
-            states[side].G.add_(adjoint_F[frame])
+            states[side].H.add_(adjoint_F[frame])
             for run in reversed(self.runs[frame - 1]):
                 substeps.state(0).flat.copy_(run.flat)
                 substeps.set_window(run.lowest, run.size)
@@ -209,7 +211,7 @@ class _Solver:
                 substeps.run(run.clock, path)
                 side = substeps.reverse(run.clock, path, side)
         states[side].u.add_(adjoint_u[0])
-        states[side].G.add_(adjoint_F[0])
+        states[side].H.add_(adjoint_F[0])
         substeps.state(0).flat.copy_(self.initial)
         substeps.start(self._clock(0.0, 0.0, 1), 0, 1)
         side = substeps.reverse_start(self._clock(0.0, 0.0, 1), 0, 1, side)
@@ -295,21 +297,10 @@ class _Solver:
             rows.append([dt, math.exp(-self.world.damping * dt), *signals])
         return np.array(rows)
 
-    def _stretch(self, now) -> tuple[Tensor, Tensor]:
-        """(largest principal stretch, J) of the elastic deformation of every particle."""
-        F = now.H.double() + torch.eye(3, dtype=torch.float64, device=now.H.device)
-        C = F.mT @ F
-        mean = C.diagonal(dim1=1, dim2=2).mean(1)
-        B = C - mean[:, None, None] * torch.eye(3, dtype=C.dtype, device=C.device)
-        p = (B.square().sum((1, 2)) / 6).sqrt().clamp(min=1e-100)
-        r = (torch.linalg.det(B) / (2 * p**3)).clamp(-1, 1)
-        return (mean + 2 * p * torch.cos(torch.acos(r) / 3)).clamp(min=0).sqrt(), torch.linalg.det(F)
-
     def _speeds(self, now) -> tuple[float, float]:
-        """(fastest wave, fastest particle) [m/s]. Waves are s times faster at stretch s; compression stiffens."""
-        stretch, J = self._stretch(now)
-        stiffening = stretch.clamp(min=1) * (1 - J.clamp(1e-4, 1).log()).sqrt()
-        c = ((self.modulus.double() / self.world.density).sqrt() * stiffening).max()
+        """(fastest wave, fastest particle) [m/s]."""
+        low, high = _extreme_eigenvalues(now.tau.double())
+        c = ((self.modulus.double() + 2 * torch.maximum(high, -low)) / self.world.density).sqrt().max()
         return float(c), float(now.v.double().norm(dim=1).max())
 
     def _limit(self, now) -> float:
@@ -337,7 +328,8 @@ class _Solver:
 
     def _health(self, now) -> dict[str, float]:
         """Numbers of one frame for a person to look at; SI. energy counts kinetic, elastic and potential energy."""
-        stretch, J = self._stretch(now)
+        F = now.H.double() + torch.eye(3, dtype=torch.float64, device=now.H.device)
+        J, stretch = torch.linalg.det(F), _extreme_eigenvalues(F.mT @ F)[1].sqrt()
         mass, v = self.mass.double(), now.v.double()
         x = self.rest.double() + now.u.double()
         momentum = (mass[:, None] * v).sum(0)
@@ -407,7 +399,6 @@ class _Solver:
             steers=tuple[Hook, ...](steers),
             material=world.material.advance(real),
             memory_rows=world.material.memory_rows,
-            plastic=world.material.plastic,
             longest_run=RUN,
             threads=threads,
         )
@@ -491,6 +482,16 @@ def _sorted_by_cell(position: Tensor, dx: float) -> Tensor:
     cell = cell - cell.amin(0)
     size = cell.amax(0) + 1
     return torch.argsort((cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2], stable=True)
+
+
+def _extreme_eigenvalues(S: Float[Tensor, "n 3 3"]) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
+    """(lowest, highest) eigenvalue of symmetric matrices, in closed form (Smith 1961)."""
+    one = torch.eye(3, dtype=S.dtype, device=S.device)
+    mean = S.diagonal(dim1=1, dim2=2).mean(1)
+    B = S - mean[:, None, None] * one
+    p = (B.square().sum((1, 2)) / 6).sqrt().clamp(min=1e-100)
+    angle = torch.acos((torch.linalg.det(B / p[:, None, None]) / 2).clamp(-1, 1)) / 3
+    return mean + 2 * p * torch.cos(angle + 2 * math.pi / 3), mean + 2 * p * torch.cos(angle)
 
 
 def _isolated(position: Tensor, dx: float) -> int:

@@ -22,21 +22,16 @@ class State:
     v: Tensor  # velocity [n, 3] m/s
     L: Tensor  # velocity gradient and affine velocity [n, 3, 3] 1/s
     tau: Tensor  # Kirchhoff stress [n, 3, 3] Pa
-    H: Tensor  # elastic deformation minus identity [n, 3, 3]
-    G: Tensor  # total deformation minus identity [n, 3, 3]; the same memory as H unless the material is plastic
+    H: Tensor  # total deformation minus identity [n, 3, 3]
     memory: Tensor  # internal variables [m, n]
     v_gathered: Tensor  # before steering [n, 3]; the same memory as v unless something steers
     L_gathered: Tensor  # [n, 3, 3], likewise
     warp: dict[str, wp.array] = field(repr=False)  # the same arrays for Warp
 
 
-def make_state(
-    n: int, memory_rows: int, *, plastic: bool, steered: bool, dtype: torch.dtype, device: str | torch.device
-) -> State:
+def make_state(n: int, memory_rows: int, *, steered: bool, dtype: torch.dtype, device: str | torch.device) -> State:
     """A state of zeros; zero is the body at rest."""
     shapes = {"u": (n, 3), "v": (n, 3), "L": (n, 3, 3), "tau": (n, 3, 3), "H": (n, 3, 3)}
-    if plastic:
-        shapes["G"] = (n, 3, 3)
     if memory_rows:
         shapes["memory"] = (memory_rows, n)
     if steered:
@@ -46,7 +41,7 @@ def make_state(
     parts = dict(zip(shapes, flat.split(list(counts.values()))))
     views = {name: part.view(shapes[name]) for name, part in parts.items()}
     views.setdefault("memory", torch.zeros((0, n), dtype=dtype, device=device))
-    for name, other in (("G", "H"), ("v_gathered", "v"), ("L_gathered", "L")):
+    for name, other in (("v_gathered", "v"), ("L_gathered", "L")):
         views.setdefault(name, views[other])
     real = wp.float32 if dtype == torch.float32 else wp.float64
     kinds = {(n, 3): vector(real), (n, 3, 3): matrix(real)}

@@ -145,7 +145,7 @@ def _steer(real, hooks: tuple[Hook, ...]) -> wp.Kernel:
 
 
 @cache
-def _advance(real, material: wp.Function, plastic: bool) -> wp.Kernel:
+def _advance(real, material: wp.Function) -> wp.Kernel:
     vec3, mat33 = vector(real), matrix(real)
 
     @wp.kernel(module="unique")
@@ -158,25 +158,20 @@ def _advance(real, material: wp.Function, plastic: bool) -> wp.Kernel:
         v: wp.array(dtype=vec3),
         L: wp.array(dtype=mat33),
         H: wp.array(dtype=mat33),
-        G: wp.array(dtype=mat33),
         coefficients: wp.array2d(dtype=real),  # [k, p]
         memory: wp.array2d(dtype=real),  # [m, p]
         # out
         u_next: wp.array(dtype=vec3),
         H_next: wp.array(dtype=mat33),
-        G_next: wp.array(dtype=mat33),
         memory_next: wp.array2d(dtype=real),
         tau: wp.array(dtype=mat33),
     ):
         p = wp.tid() + first
         dt = clock[row[0], 0]
         u_next[p] = u[p] + dt * v[p]
-        elastic, stress = material(p, dt, L[p], H[p], coefficients, memory, memory_next)
-        H_next[p] = elastic
+        deformation, stress = material(p, dt, L[p], H[p], coefficients, memory, memory_next)
+        H_next[p] = deformation
         tau[p] = stress
-        if wp.static(plastic):
-            M = dt * L[p]
-            G_next[p] = G[p] + M + M * G[p]
 
     return advance_kernel
 
@@ -214,7 +209,6 @@ class Substeps:
         steers: tuple[Hook, ...],
         material: wp.Function,
         memory_rows: int,
-        plastic: bool,
         longest_run: int,  # substeps
         threads: int,
     ):
@@ -228,13 +222,13 @@ class Substeps:
             "scatter": transfer.scatter(self.real),
             "update": _update(self.real, nodes),
             "gather": transfer.gather(self.real),
-            "advance": _advance(self.real, material, plastic),
+            "advance": _advance(self.real, material),
         }
         if pushes:
             self.kernels["push"] = _push(self.real, pushes)
         if steers:
             self.kernels["steer"] = _steer(self.real, steers)
-        self.shape = dict(memory_rows=memory_rows, plastic=plastic, steered=bool(steers))
+        self.shape = dict(memory_rows=memory_rows, steered=bool(steers))
         vec3, real = vector(self.real), self.real
         self.constant = {
             "mass": wp.from_torch(mass),
@@ -430,8 +424,8 @@ class Substeps:
             "gather": ([first, self.dx, self.window, *place, self.node_velocity], [b["v_gathered"], b["L_gathered"]]),
             "steer": ([*hooked, b["v_gathered"], b["L_gathered"]], [b["v"], b["L"]]),
             "advance": (
-                [first, *clock, a["u"], b["v"], b["L"], a["H"], a["G"], c["coefficients"], a["memory"]],
-                [b["u"], b["H"], b["G"], b["memory"], b["tau"]],
+                [first, *clock, a["u"], b["v"], b["L"], a["H"], c["coefficients"], a["memory"]],
+                [b["u"], b["H"], b["memory"], b["tau"]],
             ),
         }
 
@@ -463,8 +457,8 @@ class Substeps:
                 "update": ([*[None] * 8, q, self.adjoint_grid], [self.adjoint_node_velocity[0]]),
                 "steer": ([*hooked, b["v_gathered"], b["L_gathered"]], [b["v"], b["L"]]),
                 "advance": (
-                    [None] * 3 + [a["u"], b["v"], b["L"], a["H"], a["G"], adjoint["coefficients"], a["memory"]],
-                    [b["u"], b["H"], b["G"], b["memory"], b["tau"]],
+                    [None] * 3 + [a["u"], b["v"], b["L"], a["H"], adjoint["coefficients"], a["memory"]],
+                    [b["u"], b["H"], b["memory"], b["tau"]],
                 ),
             }
             count = self.ranges[w][1]
