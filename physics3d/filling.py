@@ -333,16 +333,18 @@ def sample_surface(gaussians: Gaussians, spacing: float) -> tuple[Surface, np.nd
     shape = shape + np.einsum("nki,nkj->nij", offset, offset) / neighbours.shape[1]
     normal = np.linalg.eigh(shape)[1][:, :, 0]
 
-    # the sky seen from both sides, from one and a half voxels off the surface: thinner walls are thin parts
+    # the sky seen from both sides, from one and a half voxels off the surface: thinner walls are thin parts; directions
+    # along the surface count a little, because from the bottom of a cup only straight up is free
     cosine = normal @ (DIRECTIONS / np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)).T
-    front, back = (
-        (~enclosure.directions(point + s * 1.5 * enclosure.h * normal) * np.maximum(s * cosine, 0)).sum(1)
-        / np.maximum(s * cosine, 0).sum(1)
-        for s in (1, -1)
-    )
+    sky = []
+    for side in (1, -1):
+        weight = np.where(side * cosine > -0.2, np.maximum(side * cosine, 0.2), 0)
+        free = ~enclosure.directions(point + side * 1.5 * enclosure.h * normal)
+        sky.append((free * weight).sum(1) / weight.sum(1))
+    front, back = sky
     normal = np.where((front >= back)[:, None], normal, -normal)
     more, less = np.maximum(front, back), np.minimum(front, back)
-    return Surface(point, normal, enclosure, thin=(less > 0.6 * more) & (more > 0.05), hidden=more <= 0.05), deviation
+    return Surface(point, normal, enclosure, thin=(less > 0.6 * more) & (more > 0.02), hidden=more <= 0.02), deviation
 
 
 def solid_cells(
