@@ -69,7 +69,7 @@ class Studio:
         self.paints = {i: m.paint for i, m in enumerate(meshes) if m.paint is not None}
         sun = np.asarray(light.to_sun, np.float32)
         sun = sun / np.linalg.norm(sun)
-        side = np.cross(sun, [0.0, 0.0, 1.0]).astype(np.float32)
+        side = np.cross(sun, np.eye(3)[np.abs(sun).argmin()]).astype(np.float32)
         side /= np.linalg.norm(side)
         across = np.cross(sun, side)
         suns = [sun + SUN_SPREAD * (a * side + b * across) for a, b in ((-1, -0.4), (0.4, -1), (-0.4, 1), (1, 0.4))]
