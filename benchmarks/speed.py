@@ -7,8 +7,6 @@ rows of one run may be compared with each other and with nothing else.
 """
 
 import csv
-import os
-import platform
 import statistics
 import sys
 import time
@@ -16,6 +14,7 @@ from pathlib import Path
 
 import torch
 import warp as wp
+from machine import machine
 
 from physics3d.gaussians.cameras import Camera, look_at
 from physics3d.gaussians.rasterize import rasterize
@@ -145,8 +144,7 @@ def write(rows: list[dict], device: str, seed: int) -> None:
     from matplotlib.figure import Figure
 
     RESULTS.mkdir(parents=True, exist_ok=True)
-    machine = torch.cuda.get_device_name() if device.startswith("cuda") else f"{cpu()}, {os.cpu_count()} cores"
-    title = f"{machine}; torch {torch.__version__}, warp {wp.config.version}, seed {seed}"
+    title = f"{machine(device)}, seed {seed}"
     kind = device.split(":")[0]
     with (RESULTS / f"speed_{kind}.csv").open("w", newline="") as file:
         file.write(f"# {title}\n")
@@ -166,14 +164,6 @@ def write(rows: list[dict], device: str, seed: int) -> None:
     axis.title.set_size(8)
     axis.legend(fontsize=8)
     figure.savefig(RESULTS / f"speed_{kind}.png", dpi=110)
-
-
-def cpu() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor() or platform.machine()
 
 
 if __name__ == "__main__":
