@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 
 from physics3d.gaussians.cameras import Camera, look_at
-from physics3d.scenes.axes import OPENGL_TO_OPENCV, Axes
+from physics3d.scenes.axes import Axes
 
 WIDTH, HEIGHT, FOCAL = 48, 36, 60.0
 
@@ -60,6 +60,14 @@ def to_source(camera: Camera, axes: Axes) -> torch.Tensor:
     return M
 
 
+def opengl_pose(world_to_camera: torch.Tensor) -> torch.Tensor:
+    """camera_to_world whose columns are the camera's right, up (against OpenCV's y), backward (against z) and place."""
+    R, t = world_to_camera[:3, :3], world_to_camera[:3, 3]
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3] = torch.stack([R[0], -R[1], -R[2], -R.T @ t], 1)
+    return pose
+
+
 def points_to_source(axes: Axes) -> np.ndarray:
     return (points()[0] @ axes.rotation() / axes.scale).numpy()
 
@@ -76,7 +84,7 @@ def write_transforms(folder: Path, axes: Axes, *, blender: bool) -> None:
     names = write_images(folder / "images")
     frames = []
     for name, camera in zip(names, cameras()):
-        pose = torch.linalg.inv(to_source(camera, axes)) @ OPENGL_TO_OPENCV
+        pose = opengl_pose(to_source(camera, axes))
         file = f"./images/{name}".removesuffix(".png") if blender else f"images/{name}"
         frames.append({"file_path": file, "transform_matrix": pose.tolist()})
     head = (
@@ -143,7 +151,7 @@ def write_pac_nerf(folder: Path, axes: Axes) -> None:
     (folder / "data").mkdir(parents=True)
     entries = []
     for c, camera in enumerate(cameras()):
-        pose = torch.linalg.inv(to_source(camera, axes)) @ OPENGL_TO_OPENCV
+        pose = opengl_pose(to_source(camera, axes))
         K = [[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]]
         for t in range(-1, 4):
             entry = {"file_path": f"./data/r_{c}_{t}.png", "time": t / 24, "c2w": pose[:3].tolist(), "intrinsic": K}

@@ -44,6 +44,20 @@ def write(kind: str, folder: Path, axes: Axes):
 STATIC = ("blender", "pinhole", "colmap_text", "colmap_binary")
 
 
+def test_y_up_becomes_z_up_by_a_quarter_turn():
+    moved = Axes(up=(0.0, 1.0, 0.0), scale=2.0).points(torch.tensor([[1.0, 2.0, 3.0]]))
+    torch.testing.assert_close(moved, torch.tensor([[2.0, -6.0, 4.0]]))
+
+
+@pytest.mark.parametrize("axes", AXES)
+def test_up_becomes_z_and_nothing_is_mirrored(axes):
+    Q = axes.rotation()
+    up = torch.tensor(axes.up, dtype=torch.float64)
+    torch.testing.assert_close(Q @ up / up.norm(), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+    torch.testing.assert_close(Q @ Q.T, torch.eye(3, dtype=torch.float64))
+    assert torch.det(Q) > 0
+
+
 @pytest.mark.parametrize("axes", AXES, ids=lambda a: f"up{a.up}")
 @pytest.mark.parametrize("kind", STATIC)
 def test_every_format_gives_back_the_same_cameras_images_and_points(kind, axes, tmp_path):
