@@ -13,7 +13,7 @@ from physics3d.mpm.boundaries.impulse import Impulse
 from physics3d.mpm.materials.viscoelastic import Viscoelastic
 from physics3d.mpm.world import World
 from physics3d.scenes.base import AbstractSource, Capture
-from physics3d.scenes.photographs import held_out
+from physics3d.scenes.photographs import held_out, triple
 from physics3d.scenes.studio import Light, Mesh, Studio, photographs, ring, surface_grid, to_linear
 from physics3d.scenes.synthetic import film, particles
 
@@ -74,13 +74,17 @@ class BallTwin(AbstractSource):
         )
         position, volume = particles([mesh], self.dx / 2, self.seed)
         push = Impulse(
-            force=tuple(self.evaluate_force), centre=centre, radius=1.2 * RADIUS, start=0.0, duration=self.push
+            force=triple("evaluate_force", self.evaluate_force),
+            centre=centre,
+            radius=1.2 * RADIUS,
+            start=0.0,
+            duration=self.push,
         )
         witness = ring(
             (0.0, 0.0, RADIUS),
             distance=0.32,
             elevation=12,
-            azimuths=[-90],
+            azimuths=np.array([-90.0]),
             width=self.width,
             height=self.height,
             opening=36,

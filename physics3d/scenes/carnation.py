@@ -20,7 +20,7 @@ from physics3d.mpm.materials.viscoelastic import Viscoelastic
 from physics3d.mpm.world import World
 from physics3d.scenes.base import AbstractSource, Capture
 from physics3d.scenes.flower import SOIL, blossom_centre, plant, surroundings
-from physics3d.scenes.photographs import held_out
+from physics3d.scenes.photographs import held_out, triple
 from physics3d.scenes.studio import Light, Studio, photographs, ring
 from physics3d.scenes.synthetic import film, particles
 
@@ -65,14 +65,26 @@ class CarnationTwin(AbstractSource):
         )
         position, volume = particles(solids, self.dx / 2, self.seed)
         (witness,) = ring(
-            TARGET, distance=0.5, elevation=14, azimuths=[-84], width=self.width, height=self.height, opening=OPENING
+            TARGET,
+            distance=0.5,
+            elevation=14,
+            azimuths=np.array([-84.0]),
+            width=self.width,
+            height=self.height,
+            opening=OPENING,
         )
         takes = [
             film(
                 role=role,
                 world=self.world(),
                 excitation=(
-                    Impulse(force=tuple(force), centre=blossom_centre(), radius=0.05, start=0.0, duration=self.push),
+                    Impulse(
+                        force=triple("force", force),
+                        centre=blossom_centre(),
+                        radius=0.05,
+                        start=0.0,
+                        duration=self.push,
+                    ),
                 ),
                 position=position,
                 volume=volume,

@@ -17,7 +17,7 @@ import torch
 from physics3d.gaussians.cameras import Camera
 from physics3d.scenes.axes import Axes, rigid_inverse
 from physics3d.scenes.base import AbstractSource, Capture
-from physics3d.scenes.photographs import held_out, mattes, read_photograph, require_folder
+from physics3d.scenes.photographs import held_out, mattes, read_photograph, require_folder, triple
 
 # model id in binary files -> name and names of the parameters
 MODELS = {
@@ -49,14 +49,16 @@ class ColmapSource(AbstractSource):
 
     def __call__(self, *, log) -> Capture:
         model = self._read()
-        axes = Axes(up=tuple(self.up), scale=self.scale)
+        axes = Axes(up=triple("up", self.up), scale=self.scale)
         axes.check()
         folder = require_folder(Path(self.path) / "images", "folder of images")
         views = self._chosen(model)
         images, alphas, cameras, names = [], [], [], []
         for view in log.progress(views, "reading images"):
             path = folder / view.name
-            image, alpha, size = read_photograph(path, background=tuple(self.background), resolution=self.resolution)
+            image, alpha, size = read_photograph(
+                path, background=triple("background", self.background), resolution=self.resolution
+            )
             if view.lens not in model.lenses:
                 raise ValueError(f"{path}: its camera {view.lens} is not in {model.files[0]}; the model is incomplete")
             camera = _camera(model.lenses[view.lens], view, path, size, axes)
@@ -75,7 +77,7 @@ class ColmapSource(AbstractSource):
             names=tuple(names),
             held_out=held_out(len(images), self.held_out_every),
             alphas=mattes(names, alphas),
-            background=tuple(self.background),
+            background=triple("background", self.background),
             points=points,
             point_colors=torch.from_numpy(model.rgb[kept].astype(np.float32) / 255) if len(kept) else None,
             single_object=self.single_object,
@@ -191,7 +193,9 @@ def _read_binary(files: tuple[Path, ...]) -> _Model:
             model.views.append(_View(number, name, lens, tuple(pose[:4]), tuple(pose[4:])))
         file = files[2]
         data, at = file.read_bytes(), 8
-        xyz, rgb, index, view = [], [], [], []
+        xyz, rgb = [], []
+        index: list[int] = []
+        view: list[int] = []
         for i in range(struct.unpack_from("<Q", data)[0]):
             _, x, y, z, r, g, b, _, length = struct.unpack_from("<Q3d3BdQ", data, at)
             xyz.append((x, y, z))
@@ -229,7 +233,7 @@ def _camera(lens: _Lens, view: _View, path: Path, size: tuple[int, int], axes: A
             f"{path}: camera model {lens.model} is not one of {list(PARAMETERS)}; run colmap image_undistorter"
         )
     p = dict(zip(PARAMETERS[lens.model], lens.parameters))
-    fx, fy = p.get("fx", p.get("f")), p.get("fy", p.get("f"))
+    fx, fy = (p["f"], p["f"]) if "f" in p else (p["fx"], p["fy"])
     corner = math.hypot(max(p["cx"], lens.width - p["cx"]) / fx, max(p["cy"], lens.height - p["cy"]) / fy)
     shift = fx * abs(p.get("k1", 0) * corner**3 + p.get("k2", 0) * corner**5)
     if shift > LARGEST_SHIFT:

@@ -19,7 +19,7 @@ import torch
 from physics3d.gaussians.cameras import Camera
 from physics3d.scenes.axes import OPENGL_TO_OPENCV, Axes, rigid_inverse
 from physics3d.scenes.base import AbstractSource, Capture, Take
-from physics3d.scenes.photographs import mattes, read_photograph, require_folder
+from physics3d.scenes.photographs import mattes, read_photograph, require_folder, triple
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +58,7 @@ class PacNerfSource(AbstractSource):
             for t in instants:
                 path, entry = entries[c][t]
                 image, alpha, size = read_photograph(
-                    path, background=tuple(self.background), resolution=self.resolution
+                    path, background=triple("background", self.background), resolution=self.resolution
                 )
                 camera = _camera(path, entry, size, axes)
                 times[t] = float(entry["time"])
@@ -73,7 +73,7 @@ class PacNerfSource(AbstractSource):
                         f"{path} is {tuple(image.shape)}, frame 0 of its camera {tuple(clip[0].shape)}; resize one"
                     )
             videos.append(torch.stack(clip))
-        takes = ()
+        takes: tuple[Take, ...] = ()
         if len(instants) > 1:
             fps = (len(instants) - 1) / (times[instants[-1]] - times[0])
             take = Take(
@@ -92,7 +92,7 @@ class PacNerfSource(AbstractSource):
             names=tuple(names),
             held_out=tuple(self.held_out_cameras),
             alphas=mattes(names, alphas),
-            background=tuple(self.background),
+            background=triple("background", self.background),
             takes=takes,
             single_object=True,
             truth=dict(self.truth),

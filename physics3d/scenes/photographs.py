@@ -3,6 +3,7 @@
 C = alpha C_file + (1 - alpha) background          (on the encoded values, as renderers and mattes usually mean it)
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +31,7 @@ def read_photograph(
     except Exception as error:  # PIL raises OSError, SyntaxError, zlib.error, DecompressionBombError ...
         raise ValueError(f"cannot read the image {path}: {error}; the file is broken, replace it") from error
     size = picture.size
-    array = np.asarray(picture, np.float32)
+    array: np.ndarray = np.asarray(picture, np.float32)
     alpha = None
     if array.shape[-1] == 4:
         matte = array[..., 3:] / 255
@@ -43,6 +44,14 @@ def check_resolution(resolution: float | None) -> None:
     """Raise ValueError unless `resolution` is None or a factor in (0, 1]."""
     if resolution is not None and not 0 < resolution <= 1:
         raise ValueError(f"resolution is {resolution}; it is the factor on both sides of an image, in (0, 1], or null")
+
+
+def triple(name: str, value: Sequence[float]) -> tuple[float, float, float]:
+    """Three finite numbers as a tuple, whatever sequence a configuration gave. Raises ValueError naming the field."""
+    numbers = [float(v) for v in value]
+    if len(numbers) != 3 or not np.isfinite(numbers).all():
+        raise ValueError(f"{name} is {value}; give three numbers")
+    return numbers[0], numbers[1], numbers[2]
 
 
 def mattes(names: list[str], alphas: list[Tensor | None]) -> tuple[Tensor, ...]:

@@ -19,6 +19,7 @@ from physics3d.gaussians.render import render
 from physics3d.gaussians.sh import sh_basis
 from physics3d.scenes.axes import Axes
 from physics3d.scenes.base import AbstractSource, Capture
+from physics3d.scenes.photographs import triple
 from physics3d.scenes.studio import ring
 from physics3d.video import to_uint8
 
@@ -45,7 +46,7 @@ class PlyScene(AbstractSource):
             raise ValueError(
                 f"views is {self.views}, opening {self.opening}; take at least 1 view and 0 to 180 degrees"
             )
-        gaussians = oriented(read_ply(Path(self.path)), Axes(up=tuple(self.up), scale=self.scale))
+        gaussians = oriented(read_ply(Path(self.path)), Axes(up=triple("up", self.up), scale=self.scale))
         solid = gaussians.mean[gaussians.opacity >= gaussians.opacity.median()].double()
         centre = solid.median(0).values
         radius = float((solid - centre).norm(dim=1).quantile(0.9))
@@ -60,7 +61,7 @@ class PlyScene(AbstractSource):
         )
         with torch.no_grad():
             images = [
-                to_uint8(render(gaussians, camera, background=tuple(self.background)).color)
+                to_uint8(render(gaussians, camera, background=triple("background", self.background)).color)
                 for camera in log.progress(cameras, "drawing the views")
             ]
         log.info(
@@ -71,7 +72,7 @@ class PlyScene(AbstractSource):
             images=tuple(images),
             cameras=tuple(cameras),
             names=tuple(f"ring_{i:03d}" for i in range(len(cameras))),
-            background=tuple(self.background),
+            background=triple("background", self.background),
             gaussians=gaussians,
             single_object=self.single_object,
         )

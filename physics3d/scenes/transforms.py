@@ -19,7 +19,7 @@ import torch
 from physics3d.gaussians.cameras import Camera
 from physics3d.scenes.axes import OPENGL_TO_OPENCV, Axes, rigid_inverse
 from physics3d.scenes.base import AbstractSource, Capture
-from physics3d.scenes.photographs import held_out, mattes, read_photograph
+from physics3d.scenes.photographs import held_out, mattes, read_photograph, triple
 
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 
@@ -43,14 +43,16 @@ class TransformsSource(AbstractSource):
 
     def __call__(self, *, log) -> Capture:
         file, content = self._read()
-        axes = Axes(up=tuple(self.up), scale=self.scale)
+        axes = Axes(up=triple("up", self.up), scale=self.scale)
         axes.check()
         frames = sorted(content["frames"], key=lambda frame: str(_image_path(file, frame)))
         images, alphas, cameras, names = [], [], [], []
         for frame in log.progress(frames, "reading images"):
             path = _image_path(file, frame)
             name = str(path.relative_to(file.parent)) if path.is_relative_to(file.parent) else str(path)
-            image, alpha, size = read_photograph(path, background=tuple(self.background), resolution=self.resolution)
+            image, alpha, size = read_photograph(
+                path, background=triple("background", self.background), resolution=self.resolution
+            )
             camera = _camera(file, {**content, **frame}, path, size, axes)
             images.append(image)
             alphas.append(alpha)
@@ -65,7 +67,7 @@ class TransformsSource(AbstractSource):
             names=tuple(names),
             held_out=held_out(len(images), self.held_out_every),
             alphas=mattes(names, alphas),
-            background=tuple(self.background),
+            background=triple("background", self.background),
             points=points,
             point_colors=colors,
             single_object=self.single_object,
