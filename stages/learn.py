@@ -12,7 +12,7 @@ from physics3d.filling import Body
 from physics3d.gaussians.deform import render_deformed
 from physics3d.gaussians.model import Gaussians
 from physics3d.learning.fields import GlobalField
-from physics3d.learning.fit import Chain, fit, physical, search, sensitivity
+from physics3d.learning.fit import Chain, fit, physical, polish, search, sensitivity
 from physics3d.log import Log
 from physics3d.mpm.rollout import rollout
 from physics3d.mpm.world import Estimate, World
@@ -33,6 +33,7 @@ class Learn:
     ] = ()  # groups that share one factor, e.g. [[youngs_modulus, branch_shear_modulus]]
     learn_velocity: bool = False  # one initial velocity for the whole body
     steps: int = 30  # of gradient descent
+    polish: int = 0  # Gauss-Newton steps after the descent; one costs a forward run per parameter and two
     learning_rate: float = 0.1  # first step of theta: 0.1 is ten per cent of a parameter
     duration: float | None = None  # only the first part of the take is used [s]; None: all of it
     frames: int = 15  # of the take, evenly spaced over the duration
@@ -48,7 +49,8 @@ class Learn:
     seed: int = 0
 
     def __post_init__(self):
-        for name, lowest in (("steps", 0), ("frames", 2), ("frames_per_step", 0), ("views_per_step", 0), ("search", 0)):
+        counts = ("steps", "polish", "frames_per_step", "views_per_step", "search")
+        for name, lowest in (("frames", 2), *((name, 0) for name in counts)):
             if getattr(self, name) < lowest:
                 raise ValueError(f"learn.{name} is {getattr(self, name)}; it must be at least {lowest}")
         for name in ("learning_rate", "image_scale", "largest_gradient"):
@@ -100,6 +102,8 @@ class Learn:
                 seed=self.seed,
                 log=log,
             )
+        if self.polish:
+            theta = polish(chain, field, theta, steps=self.polish, stay=self.stay, seed=self.seed, log=log)
         learned = replace(
             start,
             parameters={name: v.detach().to(torch.float32) for name, v in field.parameters(theta).items()},
@@ -198,7 +202,7 @@ class Learn:
 
     def report(self, capture: Capture, chain: Chain, field: GlobalField, theta: Tensor, log: Log) -> None:
         """One line per component: from, to, truth, how visible it is and how far it can be trusted."""
-        seen = sensitivity(chain, field, theta)
+        seen = sensitivity(chain, field, theta, seed=self.seed)
         before, after = physical(field, field.zero()), physical(field, theta)
         for name in field.names:
             rms, error = seen[name]

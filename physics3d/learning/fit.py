@@ -5,7 +5,8 @@
 One backward pass goes through prior, renderer and the whole trajectory, every substep of it. Each step looks at a
 random choice of views and, spread over the whole clip, of frames. Adam steps in theta (`fields.py`), its rate falling
 to a tenth along a cosine; L is divided by L_0, so that `stay` and the clip on the gradient's norm mean the same in
-every scene. A gradient that is not finite is reported and answered by going half the way back to the last good point.
+every scene. A gradient that is not finite is reported and answered by going half the way back to the last good point. `search` before and `polish` after it
+need forward runs only.
 """
 
 import math
@@ -139,25 +140,87 @@ def fit(
     return (mean if losses[0] <= losses[1] else best), history
 
 
-def sensitivity(
-    chain: Chain, field: GlobalField, theta: Tensor, *, step: float = 0.05
-) -> dict[str, tuple[float, float]]:
+@dataclass(frozen=True)
+class Linear:
+    """The chain around theta: code(theta + d) = code + J d, over all views and frames; sums divided by N pixels."""
+
+    JJ: Tensor  # w J^T J / N [k, k]
+    Jr: Tensor  # w J^T (z0 - x0_hat) / N [k]: the SDS gradient
+    rms: Tensor  # of the columns of J [k], colour in 0..1
+    residual: float  # rms of z0 - x0_hat
+    count: int  # numbers in the code
+
+
+def linearise(chain: Chain, field: GlobalField, theta: Tensor, *, seed: int, step: float = 0.05) -> Linear:
+    """J by forward differences in theta: k + 1 simulations, none of them differentiated."""
+    k, frames = len(theta), torch.arange(len(next(iter(chain.clips.values()))))
+    JJ, Jr, squares, residual, count, pixels = (
+        torch.zeros(k, k).double(),
+        torch.zeros(k).double(),
+        torch.zeros(k),
+        0.0,
+        0,
+        0,
+    )
+    with torch.no_grad():
+        motions = [chain.simulate(t) for t in (theta, *(theta + step * torch.eye(k, dtype=theta.dtype)))]
+        for view, clip in chain.clips.items():
+            codes = [chain.prior.encode(chain.render(motion, view, frames)) for motion in motions]
+            generator = torch.Generator().manual_seed(seed)
+            level = chain.prior.level(generator)
+            noise = torch.randn(codes[0].shape, generator=generator).to(codes[0])
+            condition = chain.prior.condition(clip[0], (clip,))
+            estimate = chain.prior.x0_hat(level.alpha * codes[0] + level.sigma * noise, level, condition)
+            J = torch.stack([(code - codes[0]).flatten() / step for code in codes[1:]], 1).double().cpu()
+            r, w = (codes[0] - estimate).flatten().double().cpu(), chain.prior.weight(level)
+            JJ, Jr, squares = JJ + w * J.T @ J, Jr + w * J.T @ r, squares + J.square().sum(0)
+            residual, count, pixels = residual + float(r.square().sum()), count + len(r), pixels + clip.numel()
+    return Linear(JJ / pixels, Jr / pixels, (squares / count).sqrt(), math.sqrt(residual / count), count)
+
+
+def polish(
+    chain: Chain, field: GlobalField, theta: Tensor, *, steps: int, stay: float, seed: int, log: Log
+) -> Float[Tensor, " k"]:
+    """Levenberg's steps on L: what Adam leaves undone in narrow valleys where one parameter stands in for another.
+
+        (J^T J + stay L_0 + m max diag J^T J) d = -(J^T (z0 - x0_hat) + stay L_0 theta)
+
+    m grows by 8 on failure and falls by 4 on success. It is the same for all components, so that one which the pictures
+    hardly show moves least.
+    """
+    unit, m = max(chain.measure(field.zero(), seed), 1e-12), 1e-3
+    total = lambda t: chain.measure(t, seed) + 0.5 * stay * unit * float(t.square().sum())
+    now, around = total(theta), None
+    for step in log.progress(range(steps), "polishing"):
+        around = around or linearise(chain, field, theta, seed=seed)
+        pull = stay * unit
+        A = around.JJ + (m * around.JJ.diagonal().max() + pull + 1e-9 * unit) * torch.eye(len(theta)).double()
+        d = torch.linalg.solve(A, -(around.Jr + pull * theta))
+        trial = field.bound(theta + d.clamp(-1, 1))  # at most a factor e at once
+        then = total(trial)
+        log.metric("polish/loss", min(now, then), step)
+        if then < now:
+            theta, now, around, m = trial, then, None, m / 4
+        else:
+            m *= 8
+    log.info(f"polished: loss {chain.measure(theta, seed):.5g}")
+    return theta
+
+
+def sensitivity(chain: Chain, field: GlobalField, theta: Tensor, *, seed: int) -> dict[str, tuple[float, float]]:
     """How well each component can be told: name -> (change of the code per unit of theta [rms x 255], error of theta).
 
-    J = d code/d theta by forward differences, in the first view. The error is sqrt(diag(s^2 (J^T J)^-1)) with the
-    residual's mean square s^2, as if residuals were independent from pixel to pixel: they are not, so it is a lower
-    bound. Infinite if unobservable.
+    The error is sqrt(diag(s^2 (J^T J)^-1)) with the residual's mean square s^2, as if residuals were independent from
+    pixel to pixel: they are not, so it is a lower bound. Infinite if unobservable.
     """
-    views, frames = list(chain.clips)[:1], torch.arange(len(next(iter(chain.clips.values()))))
-    with torch.no_grad():
-        code = lambda t: chain.prior.encode(chain.render(chain.simulate(t), views[0], frames)).flatten().double()
-        here, unit = code(theta), torch.eye(len(theta), dtype=theta.dtype)
-        J = torch.stack([(code(theta + step * unit[j]) - here) / step for j in range(len(theta))], 1)
-        residual = here - chain.prior.encode(chain.clips[views[0]][frames]).flatten().double()
-    variance = torch.linalg.pinv(J.T @ J, hermitian=True).diagonal() * residual.square().mean()
-    rms = 255 * J.square().mean(0).sqrt()
-    error = torch.where(rms > 1e-3, variance.clamp_min(0).sqrt(), torch.inf)
-    return {name: (float(r), float(e)) for name, r, e in zip(field.names, rms, error)}
+    around = linearise(chain, field, theta, seed=seed)
+    scale = around.rms.clamp_min(1e-12).double()
+    correlation = around.JJ / around.JJ.diagonal().sqrt().clamp_min(1e-12).outer(
+        around.JJ.diagonal().sqrt().clamp_min(1e-12)
+    )
+    variance = torch.linalg.pinv(correlation, hermitian=True).diagonal() / scale**2 * around.residual**2 / around.count
+    error = torch.where(255 * around.rms > 1e-3, variance.clamp_min(0).sqrt(), torch.inf)
+    return {name: (255 * float(r), float(e)) for name, r, e in zip(field.names, around.rms, error)}
 
 
 def physical(field: GlobalField, theta: Tensor) -> dict[str, float]:

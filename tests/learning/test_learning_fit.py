@@ -8,7 +8,7 @@ from physics3d.gaussians import twin
 from physics3d.gaussians.deform import carry
 from physics3d.gaussians.sh import sh_color
 from physics3d.learning.fields import GlobalField
-from physics3d.learning.fit import Chain, draw_frames, fit, search, sensitivity
+from physics3d.learning.fit import Chain, draw_frames, fit, linearise, polish, search, sensitivity
 from physics3d.log import Log
 from physics3d.priors.exemplar import Exemplar
 
@@ -178,9 +178,27 @@ def test_a_gradient_that_stays_not_finite_is_an_error_with_a_remedy():
         fit(toy(always)[0], field, field.zero(), **OPTIONS)
 
 
+def test_polish_arrives_in_a_few_steps_and_leaves_the_unseen_alone():
+    chain, field = toy()
+    theta = polish(chain, field, field.zero(), steps=8, stay=0.0, seed=0, log=Log(None))
+    assert float(field.parameters(theta)["youngs_modulus"]) == pytest.approx(
+        0.4, rel=1e-3
+    )  # noiseless; J is a difference
+    assert float(theta[1]) == 0
+    assert chain.measure(theta, 0) < 1e-4 * chain.measure(field.zero(), 0)
+
+
+def test_linearised_gradient_is_the_one_of_the_backward_pass():
+    chain, field = toy()
+    theta = field.zero().requires_grad_()
+    chain.loss(theta, [0, 1], torch.arange(8), torch.Generator().manual_seed(0)).backward()
+    found = linearise(chain, field, theta.detach(), seed=0, step=1e-6).Jr
+    torch.testing.assert_close(found, theta.grad, rtol=1e-4, atol=1e-10)  # forward differences
+
+
 def test_sensitivity_tells_the_seen_from_the_unseen():
     chain, field = toy()
-    found = sensitivity(chain, field, field.zero())
+    found = sensitivity(chain, field, field.zero(), seed=0)
     assert found["youngs_modulus"][0] > 1 and 0 < found["youngs_modulus"][1] < 1
     assert found["unseen"] == (0.0, float("inf"))
 
