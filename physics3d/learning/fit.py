@@ -5,8 +5,8 @@
 One backward pass goes through prior, renderer and the whole trajectory, every substep of it. Each step looks at a
 random choice of views and, spread over the whole clip, of frames. Adam steps in theta (`fields.py`), its rate falling
 to a tenth along a cosine; L is divided by L_0, so that `stay` and the clip on the gradient's norm mean the same in
-every scene. A gradient that is not finite is reported and answered by going half the way back to the last good point. `search` before and `polish` after it
-need forward runs only.
+every scene. A gradient that is not finite is reported and answered by going half the way back to the last good point.
+`search` before and `polish` after it need forward runs only.
 """
 
 import math
