@@ -249,8 +249,8 @@ def surface_grid(
 ) -> Mesh:
     """Mesh of a parametrised surface; `closed_b` joins the last column to the first."""
     rows, columns = position.shape[:2]
-    i, j = np.meshgrid(np.arange(rows - 1), np.arange(columns if closed_b else columns - 1), indexing="ij")
-    i, j = i.reshape(-1), j.reshape(-1)
+    cells = np.meshgrid(np.arange(rows - 1), np.arange(columns if closed_b else columns - 1), indexing="ij")
+    i, j = (c.reshape(-1) for c in cells)
     k = (j + 1) % columns
     p, q, r, s = i * columns + j, i * columns + k, (i + 1) * columns + k, (i + 1) * columns + j
     faces = np.concatenate([np.stack([p, q, r], 1), np.stack([p, r, s], 1)])
