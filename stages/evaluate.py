@@ -215,7 +215,7 @@ def bars(scores: Scores):
 
     from physics3d.metrics.scores import UNITS, columns
 
-    names = columns(scores.values)
+    names = [n for n in columns(scores.values) if any(c.get(n) is not None for c in scores.values.values())]
     figure = Figure(figsize=(2.2 * len(names), 2.8), layout="constrained")
     for i, name in enumerate(names):
         axis = figure.add_subplot(1, len(names), i + 1)
