@@ -11,6 +11,7 @@ SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .PHONY: help setup run ui view test bench lint clean
 py := .venv/bin/python
+# torch's own threads spin beside those of the renderer and the simulator: OMP_NUM_THREADS=1 unless you say otherwise
 ready := .venv/.ready
 # one version of everything, in isolated builds too; sam2 without its optional CUDA extension
 pip := PIP_CONSTRAINT=constraints.txt PIP_DISABLE_PIP_VERSION_CHECK=1 SAM2_BUILD_CUDA=0 $(py) -m pip install --quiet
@@ -35,7 +36,7 @@ $(ready): pyproject.toml constraints.txt
 	@touch $@
 
 run: $(ready) ## the pipeline on SCENE; what has been computed before is reused
-	@$(py) -m pipeline scene=$(SCENE) profile=$(PROFILE) method=$(METHOD) $(if $(DATA),data=$(DATA)) $(ARGS)
+	@OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(py) -m pipeline scene=$(SCENE) profile=$(PROFILE) method=$(METHOD) $(if $(DATA),data=$(DATA)) $(ARGS)
 
 ui: $(ready) ## MLflow: prints the address of the page that compares runs, and serves it
 	@PORT=$(PORT) $(py) -m pipeline.tracking .
