@@ -7,7 +7,10 @@ Derivatives are those of the tensor function, never of single eigenvectors, so e
 
 and the polar factor has denominators s_i + s_j only. Each name below is a memoised factory: given `real` = wp.float32
 or wp.float64 it returns the Warp function. Higham, Functions of Matrices (2008), sec. 3.2; Lin, Chitalu, Komura (2022)
-for the polar factor from invariants.
+for the polar factor from invariants; Scherzinger, Dohrmann (2008) for the eigenvectors.
+
+Generated adjoints evaluate every function once more on each level of calls. What costs most is therefore written as one
+function with one adjoint, and marked `without_replay`.
 """
 
 import functools
@@ -19,6 +22,13 @@ import warp as wp
 def matrix_type(real: type) -> type:
     """3x3 matrix of `real`."""
     return wp.types.matrix((3, 3), real)
+
+
+def without_replay(function: wp.Function) -> wp.Function:
+    """`function`, not evaluated again in the reverse pass of its caller, to whom its values are then unknown: for
+    functions whose results are only stored (by a function without replay as well) or added."""
+    function.skip_replay = True
+    return function
 
 
 @functools.cache
@@ -64,9 +74,10 @@ def log1p(real: type) -> wp.Function:
         if wp.abs(x) > real(0.3):
             return wp.log(real(1.0) + x)
         s = x / (real(2.0) + x)
+        s2 = s * s
         series = real(0.0)
-        for i in range(terms):
-            series = series * s * s + real(1.0) / real(2 * (terms - i) - 1)
+        for i in range(wp.static(terms)):
+            series = series * s2 + wp.static(real(1.0 / (2 * (terms - i) - 1)))
         return real(2.0) * s * series
 
     @wp.func_grad(log1p)
@@ -85,9 +96,9 @@ def expm1(real: type) -> wp.Function:
     def expm1(x: real):
         if wp.abs(x) > real(0.3):
             return wp.exp(x) - real(1.0)
-        series = real(1.0)
-        for i in range(terms):
-            series = real(1.0) + series * x / real(terms + 1 - i)
+        series = real(0.0)
+        for i in range(wp.static(terms + 1)):
+            series = series * x + wp.static(real(1.0 / math.factorial(terms + 1 - i)))
         return x * series
 
     @wp.func_grad(expm1)
@@ -166,6 +177,32 @@ def unimodular_inverse(real: type) -> wp.Function:
     return unimodular_inverse
 
 
+_LEAST_DENOMINATOR = {wp.float32: 1e-5, wp.float64: 1e-9}  # of (s1 + s2)(s2 + s3)(s3 + s1) / |F|^3
+
+
+@functools.cache
+def _polar_denominator(real: type) -> wp.Function:
+    least = real(_LEAST_DENOMINATOR[real])
+
+    @wp.func(name=f"polar_denominator_{real.__name__}")
+    def denominator(D: real, i1: real):
+        return wp.max(D, least * i1 * wp.sqrt(i1) + real(1e-30))
+
+    return denominator
+
+
+@functools.cache
+def _polar_rotation(real: type) -> wp.Function:
+    mat33 = matrix_type(real)
+    cofactor_ = cofactor(real)
+
+    @wp.func(name=f"polar_rotation_{real.__name__}")
+    def rotation(F: mat33, b: mat33, i1: real, l: real, D: real):
+        return (real(0.5) * (l * l + i1) * F + l * cofactor_(F) - b * F) / D
+
+    return rotation
+
+
 @functools.cache
 def stretch(real: type) -> wp.Function:
     """Y = V - I of the left polar decomposition I + H = V R; R is a rotation also when J < 0.
@@ -179,19 +216,11 @@ def stretch(real: type) -> wp.Function:
     stretches of opposite sign) no rotation is defined and R shrinks to zero instead.
     """
     mat33 = matrix_type(real)
-    vec3 = wp.types.vector(3, real)
     volume_change_, cofactor_ = volume_change(real), cofactor(real)
+    denominator, rotation = _polar_denominator(real), _polar_rotation(real)
     near_steps = 3 if real is wp.float32 else 4
     tolerance = real(1e-7 if real is wp.float32 else 1e-15)
-    least = real(1e-5 if real is wp.float32 else 1e-9)
-
-    @wp.func(name=f"polar_denominator_{real.__name__}")
-    def denominator(D: real, i1: real):
-        return wp.max(D, least * i1 * wp.sqrt(i1) + real(1e-30))
-
-    @wp.func(name=f"polar_rotation_{real.__name__}")
-    def rotation(F: mat33, b: mat33, i1: real, l: real, D: real):
-        return (real(0.5) * (l * l + i1) * F + l * cofactor_(F) - b * F) / D
+    least = real(_LEAST_DENOMINATOR[real])
 
     @wp.func(name=f"stretch_{real.__name__}")
     def stretch(H: mat33):
@@ -231,12 +260,19 @@ def stretch(real: type) -> wp.Function:
         V = F * wp.transpose(rotation(F, b, i1, l, D))
         return real(0.5) * (V + wp.transpose(V)) - one
 
-    @wp.func_grad(stretch)
-    def adj_stretch(H: mat33, adj_ret: mat33):
+    return stretch
+
+
+@functools.cache
+def adjoint_of_stretch(real: type) -> wp.Function:
+    """adjoint_of_stretch(F, V, A) -> adjoint of H, given F = I + H, V = I + stretch(H) and its symmetric adjoint A."""
+    mat33 = matrix_type(real)
+    vec3 = wp.types.vector(3, real)
+    cofactor_, denominator, rotation = cofactor(real), _polar_denominator(real), _polar_rotation(real)
+
+    @wp.func(name=f"adjoint_of_stretch_{real.__name__}")
+    def adjoint_of_stretch(F: mat33, V: mat33, A: mat33):
         one = wp.identity(n=3, dtype=real)
-        F = one + H
-        V = one + stretch(H)
-        A = real(0.5) * (adj_ret + wp.transpose(adj_ret))
         b = F * wp.transpose(F)
         i1 = wp.ddot(F, F)
         l = wp.trace(V)
@@ -244,229 +280,342 @@ def stretch(real: type) -> wp.Function:
         D = denominator(wp.determinant(T), i1)
         W = V * A - A * V
         q = (cofactor_(T) * vec3(W[2, 1], W[0, 2], W[1, 0])) / D
-        Q = wp.skew(q)
-        wp.adjoint[H] += (A - Q) * rotation(F, b, i1, l, D)
+        return (A - wp.skew(q)) * rotation(F, b, i1, l, D)
 
-    return stretch
+    return adjoint_of_stretch
+
+
+@functools.cache
+def _separated_root(real: type, steps: int) -> wp.Function:
+    """The root t of t^3 - 3 t = det that is far from the two others, by 1.7 at least: a polynomial in |det|, off by
+    1.2e-6, then Newton `steps`, each of which squares the error."""
+
+    @wp.func(name=f"separated_root_{steps}_{real.__name__}")
+    def separated_root(det: real):
+        r = wp.min(real(0.5) * wp.abs(det), real(1.0))
+        t = real(-0.018108650) + r * real(0.0039638839)
+        t = real(1.7320520) + r * (real(0.33324518) + r * (real(-0.095107484) + r * (real(0.043955990) + r * t)))
+        for _ in range(steps):
+            t = t - (t * (t * t - real(3.0)) - real(2.0) * r) / (real(3.0) * t * t - real(3.0))
+        if det < real(0.0):
+            t = -t
+        return t
+
+    return separated_root
 
 
 @functools.cache
 def eigen(real: type) -> wp.Function:
-    """(x, Q) of a symmetric matrix X = Q diag(x) Q^T by cyclic Jacobi rotations. Not differentiable by itself."""
+    """(x, Q) of a symmetric matrix X = Q diag(x) Q^T, not differentiable by itself. No iteration:
+
+        X = m I + p B,   tr B = 0,  |B|^2 = 6:   t^3 - 3 t = det B,   |t| <= 2
+
+    The root far from the two others is known to round-off, so its eigenvector is a column of adj(B - t I). In the plane
+    across one Jacobi rotation is exact, whatever these two are.
+    """
     mat33 = matrix_type(real)
     vec3 = wp.types.vector(3, real)
-    small = real((6e-8 if real is wp.float32 else 1e-16) ** 2)
-
-    @wp.func(name=f"jacobi_angle_{real.__name__}")
-    def angle(app: real, aqq: real, apq: real):
-        """(cos, sin) of the rotation that annihilates apq."""
-        if apq * apq == real(0.0):  # also where the square underflows: h would be 0
-            return real(1.0), real(0.0)
-        d = aqq - app
-        h = wp.sqrt(d * d + real(4.0) * apq * apq)
-        c = wp.sqrt(real(0.5) + real(0.5) * wp.abs(d) / h)
-        s = apq / (h * c)
-        if d < real(0.0):
-            s = -s
-        return c, s
+    separated_root = _separated_root(real, 1 if real is wp.float32 else 2)
+    least = real(1e-18 if real is wp.float32 else 1e-150)
 
     @wp.func(name=f"eigen_{real.__name__}")
     def eigen(X: mat33):
-        a = X[0, 0]
-        b = X[1, 1]
-        c = X[2, 2]
-        f = X[1, 2]
-        g = X[0, 2]
-        h = X[0, 1]
-        u = vec3(real(1.0), real(0.0), real(0.0))
-        v = vec3(real(0.0), real(1.0), real(0.0))
-        w = vec3(real(0.0), real(0.0), real(1.0))
-        for _ in range(8):
-            off = f * f + g * g + h * h
-            if off <= small * (a * a + b * b + c * c):
-                break
-            # rows 0, 1
-            cos, sin = angle(a, b, h)
-            a_, b_ = a, b
-            a = cos * cos * a_ - real(2.0) * cos * sin * h + sin * sin * b_
-            b = sin * sin * a_ + real(2.0) * cos * sin * h + cos * cos * b_
-            g_ = g
-            g = cos * g_ - sin * f
-            f = sin * g_ + cos * f
-            h = real(0.0)
-            u_ = u
-            u = cos * u_ - sin * v
-            v = sin * u_ + cos * v
-            # rows 0, 2
-            cos, sin = angle(a, c, g)
-            a_, c_ = a, c
-            a = cos * cos * a_ - real(2.0) * cos * sin * g + sin * sin * c_
-            c = sin * sin * a_ + real(2.0) * cos * sin * g + cos * cos * c_
-            h_ = h
-            h = cos * h_ - sin * f
-            f = sin * h_ + cos * f
-            g = real(0.0)
-            u_ = u
-            u = cos * u_ - sin * w
-            w = sin * u_ + cos * w
-            # rows 1, 2
-            cos, sin = angle(b, c, f)
-            b_, c_ = b, c
-            b = cos * cos * b_ - real(2.0) * cos * sin * f + sin * sin * c_
-            c = sin * sin * b_ + real(2.0) * cos * sin * f + cos * cos * c_
-            h_ = h
-            h = cos * h_ - sin * g
-            g = sin * h_ + cos * g
-            f = real(0.0)
-            v_ = v
-            v = cos * v_ - sin * w
-            w = sin * v_ + cos * w
-        return vec3(a, b, c), wp.matrix_from_cols(u, v, w)
+        m = (X[0, 0] + X[1, 1] + X[2, 2]) / real(3.0)
+        a, b, c = X[0, 0] - m, X[1, 1] - m, X[2, 2] - m
+        f, g, h = X[1, 2], X[0, 2], X[0, 1]
+        p = wp.sqrt((a * a + b * b + c * c + real(2.0) * (f * f + g * g + h * h)) / real(6.0))
+        scale = real(1.0) / wp.max(p, least)
+        a, b, c = scale * a, scale * b, scale * c
+        f, g, h = scale * f, scale * g, scale * h
+        det = a * (b * c - f * f) + h * (g * f - h * c) + g * (h * f - g * b)
+        t = separated_root(det)
+        # eigenvector u of t
+        A, B, C = a - t, b - t, c - t
+        aa, bb, cc = B * C - f * f, A * C - g * g, A * B - h * h
+        ab, ac, bc = g * f - h * C, h * f - g * B, h * g - f * A
+        u = vec3(aa, ab, ac)
+        if bb > aa and bb >= cc:
+            u = vec3(ab, bb, bc)
+        elif cc > aa:
+            u = vec3(ac, bc, cc)
+        u = u / wp.sqrt(wp.dot(u, u))
+        # v, w across it
+        sign = real(1.0)
+        if u[2] < real(0.0):
+            sign = real(-1.0)
+        k = real(-1.0) / (sign + u[2])
+        l = u[0] * u[1] * k
+        v = vec3(real(1.0) + sign * u[0] * u[0] * k, sign * l, -sign * u[0])
+        w = vec3(l, sign + u[1] * u[1] * k, -u[1])
+        Bu = vec3(a * u[0] + h * u[1] + g * u[2], h * u[0] + b * u[1] + f * u[2], g * u[0] + f * u[1] + c * u[2])
+        Bv = vec3(a * v[0] + h * v[1] + g * v[2], h * v[0] + b * v[1] + f * v[2], g * v[0] + f * v[1] + c * v[2])
+        Bw = vec3(a * w[0] + h * w[1] + g * w[2], h * w[0] + b * w[1] + f * w[2], g * w[0] + f * w[1] + c * w[2])
+        vv, ww, vw = wp.dot(v, Bv), wp.dot(w, Bw), wp.dot(v, Bw)
+        # the rotation that annihilates vw
+        difference = ww - vv
+        size = wp.sqrt(difference * difference + real(4.0) * vw * vw)
+        cosine = real(1.0)
+        sine = real(0.0)
+        if size > real(0.0):
+            cosine = wp.sqrt(real(0.5) + real(0.5) * wp.abs(difference) / size)
+            sine = vw / (size * cosine)
+            if difference < real(0.0):
+                sine = -sine
+        both = cosine * sine * real(2.0) * vw
+        x = vec3(
+            m + p * wp.dot(u, Bu),
+            m + p * (cosine * cosine * vv - both + sine * sine * ww),
+            m + p * (sine * sine * vv + both + cosine * cosine * ww),
+        )
+        return x, wp.matrix_from_cols(u, cosine * v - sine * w, sine * v + cosine * w)
 
     return eigen
 
 
 @functools.cache
-def _relax_by_series(real: type) -> wp.Function:
-    """`relax_hencky` for |X| < 0.4. Powers beyond the second are eliminated by Cayley-Hamilton, so a term costs three
-    multiplications:
-
-        eps = atanh Z = Z (1 + W/3 + W^2/5 + ...),   Z = X (2 I + X)^-1,   W = Z^2          |W| < 1/16
-        X_next = X + (I + X) (e^D - I),   D = 2 (expm1(-d) dev eps + expm1(-v) tr(eps)/3 I)  |D| < 0.52
-    """
+def _relax_near_identity(real: type) -> wp.Function:
+    """`_relax` for |X| < 0.4 without eigenvectors: both results are quadratic polynomials of B (see `eigen`) through the
+    values at three nodes t_i. The error is p^3 prod(t - t_i) times a third derivative: an uncertain node costs little,
+    and two that would coincide may be held apart."""
     mat33 = matrix_type(real)
-    vec3 = wp.types.vector(3, real)
-    expm1_ = expm1(real)
-    log_terms = 6 if real is wp.float32 else 13  # truncated below 1e-8, 1e-17; at most 16, which Warp unrolls
-    exp_terms = 8 if real is wp.float32 else 14
+    expm1_, log1p_ = expm1(real), log1p(real)
+    separated_root = _separated_root(real, 0 if real is wp.float32 else 2)
+    least = real(1e-18 if real is wp.float32 else 1e-150)
+    apart = real(4e-6 if real is wp.float32 else 4e-16)
 
-    @wp.func(name=f"invariants_{real.__name__}")
-    def invariants(A: mat33):
-        trace = wp.trace(A)
-        return vec3(trace, real(0.5) * (trace * trace - wp.ddot(A, A)), wp.determinant(A))
-
-    @wp.func(name=f"times_{real.__name__}")
-    def times(c: vec3, I: vec3):
-        """Coefficients of (c0 + c1 A + c2 A^2) A, reduced by A^3 = I1 A^2 - I2 A + I3."""
-        return vec3(c[2] * I[2], c[0] - c[2] * I[1], c[1] + c[2] * I[0])
-
-    @wp.func(name=f"relax_by_series_{real.__name__}")
-    def relax(X: mat33, d: real, v: real):
-        one = wp.identity(n=3, dtype=real)
-        Z = X * wp.inverse(real(2.0) * one + X)
-        W = Z * Z
-        I = invariants(W)
-        c = vec3()
-        for i in range(log_terms):
-            c = times(c, I) + vec3(real(1.0) / real(2 * (log_terms - i) - 1), real(0.0), real(0.0))
-        eps = Z * (c[0] * one + c[1] * W + c[2] * (W * W))
-        mean = wp.trace(eps) / real(3.0) * one
-        dev = eps - mean
+    @wp.func(name=f"relax_near_identity_{real.__name__}")
+    def relax(X: mat33, mu: real, K: real, d: real, v: real):
+        m = (X[0, 0] + X[1, 1] + X[2, 2]) / real(3.0)
+        a, b, c = X[0, 0] - m, X[1, 1] - m, X[2, 2] - m
+        f, g, h = X[1, 2], X[0, 2], X[0, 1]
+        p = wp.sqrt((a * a + b * b + c * c + real(2.0) * (f * f + g * g + h * h)) / real(6.0))
+        scale = real(1.0) / wp.max(p, least)
+        a, b, c = scale * a, scale * b, scale * c
+        f, g, h = scale * f, scale * g, scale * h
+        # nodes
+        t0 = separated_root(a * (b * c - f * f) + h * (g * f - h * c) + g * (h * f - g * b))
+        r = wp.sqrt(wp.max(real(3.0) - real(0.75) * t0 * t0, apart))
+        t1 = -real(0.5) * t0 + r
+        t2 = -real(0.5) * t0 - r
+        # values
+        x0, x1, x2 = m + p * t0, m + p * t1, m + p * t2
+        e0, e1, e2 = real(0.5) * log1p_(x0), real(0.5) * log1p_(x1), real(0.5) * log1p_(x2)
+        mean = (e0 + e1 + e2) / real(3.0)
         dh = expm1_(-real(0.5) * d)
         vh = expm1_(-real(0.5) * v)
-        D = real(2.0) * (dh * (real(2.0) + dh) * dev + vh * (real(2.0) + vh) * mean)
-        I_D = invariants(D)
-        e = vec3(real(1.0), real(0.0), real(0.0))
-        for i in range(exp_terms):
-            e = times(e, I_D) / real(exp_terms + 1 - i) + vec3(real(1.0), real(0.0), real(0.0))
-        change = D * (e[0] * one + e[1] * D + e[2] * (D * D))
-        return eps + dh * dev + vh * mean, X + change + X * change
+        df = real(2.0) * dh * (real(2.0) + dh)  # 2 expm1(-d)
+        vf = real(2.0) * vh * (real(2.0) + vh) * mean
+        n0 = (real(1.0) + x0) * expm1_(df * (e0 - mean) + vf)
+        n1 = (real(1.0) + x1) * expm1_(df * (e1 - mean) + vf)
+        n2 = (real(1.0) + x2) * expm1_(df * (e2 - mean) + vf)
+        # divided differences
+        r01, r02, r12 = real(1.0) / (t0 - t1), real(1.0) / (t0 - t2), real(0.5) / r
+        e01, n01 = (e0 - e1) * r01, (n0 - n1) * r01
+        e012 = (e01 - (e0 - e2) * r02) * r12
+        n012 = (n01 - (n0 - n2) * r02) * r12
+        # powers of B
+        sum01, product01 = t0 + t1, t0 * t1
+        shear = real(2.0) * mu * (real(1.0) + dh)
+        tau0 = shear * (e0 - mean - e01 * t0 + e012 * product01) + real(3.0) * K * (real(1.0) + vh) * mean
+        tau1, tau2 = shear * (e01 - e012 * sum01), shear * e012
+        n_0, n_1 = n0 - n01 * t0 + n012 * product01, n01 - n012 * sum01
+        aa, bb, cc = a * a + h * h + g * g, h * h + b * b + f * f, g * g + f * f + c * c
+        bc, ac, ab = g * h + f * (b + c), g * (a + c) + h * f, h * (a + b) + g * f
+        tau_a, tau_b = tau0 + tau1 * a + tau2 * aa, tau0 + tau1 * b + tau2 * bb
+        tau_c = tau0 + tau1 * c + tau2 * cc
+        tau_f, tau_g, tau_h = tau1 * f + tau2 * bc, tau1 * g + tau2 * ac, tau1 * h + tau2 * ab
+        x_a, x_b = X[0, 0] + n_0 + n_1 * a + n012 * aa, X[1, 1] + n_0 + n_1 * b + n012 * bb
+        x_c = X[2, 2] + n_0 + n_1 * c + n012 * cc
+        x_f, x_g = X[1, 2] + n_1 * f + n012 * bc, X[0, 2] + n_1 * g + n012 * ac
+        x_h = X[0, 1] + n_1 * h + n012 * ab
+        return (
+            mat33(tau_a, tau_h, tau_g, tau_h, tau_b, tau_f, tau_g, tau_f, tau_c),
+            mat33(x_a, x_h, x_g, x_h, x_b, x_f, x_g, x_f, x_c),
+        )
+
+    return relax
+
+
+_FLOOR = 1e-5  # principal values of I + X below it (compression to 0.3 %) go on along the tangent of the logarithm
+
+
+@functools.cache
+def _relax(real: type) -> wp.Function:
+    """The forward function of `maxwell_hencky` and `relax_hencky`."""
+    mat33 = matrix_type(real)
+    vec3 = wp.types.vector(3, real)
+    eigen_, expm1_, log1p_ = eigen(real), expm1(real), log1p_extended(real, _FLOOR)
+    floor = real(_FLOOR)
+    relax_near_identity = _relax_near_identity(real)
+
+    @wp.func(name=f"relax_{real.__name__}")
+    def relax(X: mat33, mu: real, K: real, d: real, v: real):
+        if wp.ddot(X, X) < real(0.16):
+            near_tau, near_X = relax_near_identity(X, mu, K, d, v)
+            return near_tau, near_X
+        x, Q = eigen_(X)
+        eps = real(0.5) * vec3(log1p_(x[0]), log1p_(x[1]), log1p_(x[2]))
+        mean = (eps[0] + eps[1] + eps[2]) / real(3.0)
+        dh = expm1_(-real(0.5) * d)
+        vh = expm1_(-real(0.5) * v)
+        shear = real(2.0) * mu * (real(1.0) + dh)
+        pressure = real(3.0) * K * (real(1.0) + vh) * mean
+        df = real(2.0) * dh * (real(2.0) + dh)  # 2 expm1(-d)
+        vf = real(2.0) * vh * (real(2.0) + vh) * mean
+        stress = vec3()
+        change = vec3()
+        for i in range(3):
+            dev = eps[i] - mean
+            stress[i] = shear * dev + pressure
+            before = x[i]
+            if real(1.0) + x[i] < floor:
+                before = wp.exp(real(2.0) * eps[i]) - real(1.0)
+            change[i] = (real(1.0) + before) * expm1_(df * dev + vf) + before - x[i]
+        Qt = wp.transpose(Q)
+        return Q * wp.diag(stress) * Qt, X + Q * wp.diag(change) * Qt
 
     return relax
 
 
 @functools.cache
-def relax_hencky(real: type) -> wp.Function:
-    """Strang-exponential relaxation of the log strain eps = 1/2 ln(I + X).
-
-        relax(X, d, v) -> (eps_half, X_next)      X symmetric; d, v = dt / relaxation time of the deviator and the trace
-        eps_half = e^{-d/2} dev eps + e^{-v/2} tr(eps)/3 I
-        X_next   = exp(2 (e^{-d} dev eps + e^{-v} tr(eps)/3 I)) - I
-
-    Relaxation enters as expm1, so a slow one is an exact small increment of X and none leaves X as it is. Below 20 %
-    strain by series, twice as fast as the eigendecomposition that serves all others and the adjoint. Principal values
-    of I + X below 1e-5 (compression to 0.3 %) go on along the tangent of the logarithm.
-    """
+def _adjoint_of_relax(real: type) -> wp.Function:
+    """Adjoints of (X, mu, K, d, v) of `_relax`, of those of its two results."""
     mat33 = matrix_type(real)
     vec3 = wp.types.vector(3, real)
-    eigen_, log1p_, expm1_ = eigen(real), log1p(real), expm1(real)
-    floor = real(1e-5)
-    extended = log1p_extended(real, 1e-5)
-    relax_by_series = _relax_by_series(real)
+    eigen_, log1p_ = eigen(real), log1p_extended(real, _FLOOR)
+    floor = real(_FLOOR)
+    log_terms = 6 if real is wp.float32 else 12  # 0.04^n / (2n + 1): 3e-10, 7e-19
+    exp_terms = 5 if real is wp.float32 else 9  # 1 / (2n + 1)!: 3e-8, 8e-18
 
-    @wp.func(name=f"relax_hencky_{real.__name__}")
-    def relax(X: mat33, d: real, v: real):
-        if wp.ddot(X, X) < real(0.16):
-            eps_near, X_near = relax_by_series(X, d, v)
-            return eps_near, X_near
-        x, Q = eigen_(X)
-        dh = expm1_(-real(0.5) * d)
-        vh = expm1_(-real(0.5) * v)
-        df = dh * (real(2.0) + dh)  # expm1(-d)
-        vf = vh * (real(2.0) + vh)
-        eps = real(0.5) * vec3(extended(x[0]), extended(x[1]), extended(x[2]))
-        mean = (eps[0] + eps[1] + eps[2]) / real(3.0)
-        half = vec3()
-        change = vec3()
-        for i in range(3):
-            dev = eps[i] - mean
-            half[i] = eps[i] + dh * dev + vh * mean
-            before = x[i]
-            if real(1.0) + x[i] < floor:
-                before = wp.exp(real(2.0) * eps[i]) - real(1.0)
-            change[i] = (real(1.0) + before) * expm1_(real(2.0) * (df * dev + vf * mean)) + before - x[i]
-        eps_half = Q * wp.diag(half) * wp.transpose(Q)
-        X_next = X + Q * wp.diag(change) * wp.transpose(Q)
-        return eps_half, X_next
-
-    @wp.func(name=f"log1p_slope_{real.__name__}")
-    def log_slope(x: real, y: real):
+    @wp.func(name=f"log_slope_{real.__name__}")
+    def log_slope(x: real, y: real, log_x: real, log_y: real):
         """Divided difference of the extended ln(1 + x)."""
+        total = real(2.0) + x + y
+        difference = x - y
         if wp.min(x, y) < floor - real(1.0):
-            if wp.abs(x - y) < real(1e-3) * floor:
+            if wp.abs(difference) < real(1e-3) * floor:
                 return real(1.0) / wp.max(real(1.0) + x, floor)
-            return (extended(x) - extended(y)) / (x - y)
-        r = (x - y) / (real(1.0) + y)
-        slope = real(1.0)
-        if r != real(0.0):
-            slope = log1p_(r) / r
-        return slope / (real(1.0) + y)
+            return (log_x - log_y) / difference
+        inverse = real(1.0) / total
+        s = difference * inverse
+        s2 = s * s
+        if s2 > real(0.04):
+            return (log_x - log_y) / difference
+        series = real(0.0)
+        for i in range(wp.static(log_terms)):
+            series = series * s2 + wp.static(real(1.0 / (2 * (log_terms - i) - 1)))
+        return real(2.0) * inverse * series
 
     @wp.func(name=f"exp_slope_{real.__name__}")
-    def exp_slope(x: real, y: real):
-        """Divided difference of exp."""
-        r = x - y
-        slope = real(1.0)
-        if r != real(0.0):
-            slope = expm1_(r) / r
-        return wp.exp(y) * slope
+    def exp_slope(x: real, y: real, root_x: real, root_y: real):
+        """Divided difference of exp, whose square roots at x and y are given."""
+        h = real(0.5) * (x - y)
+        h2 = h * h
+        if h2 > real(1.0):
+            return (root_x * root_x - root_y * root_y) / (x - y)
+        series = real(0.0)
+        for i in range(wp.static(exp_terms)):
+            series = series * h2 + wp.static(real(1.0 / math.factorial(2 * (exp_terms - i) - 1)))
+        return root_x * root_y * series
 
-    @wp.func_grad(relax)
-    def adj_relax(X: mat33, d: real, v: real, adj_eps_half: mat33, adj_X_next: mat33):
+    @wp.func(name=f"adjoint_of_relax_{real.__name__}")
+    def adjoint(X: mat33, mu: real, K: real, d: real, v: real, adj_tau: mat33, adj_X_next: mat33):
         x, Q = eigen_(X)
-        eps = real(0.5) * vec3(extended(x[0]), extended(x[1]), extended(x[2]))
-        mean = (eps[0] + eps[1] + eps[2]) / real(3.0)
-        dev = eps - vec3(mean, mean, mean)
+        l = vec3(log1p_(x[0]), log1p_(x[1]), log1p_(x[2]))
+        mean = (l[0] + l[1] + l[2]) / real(6.0)
+        dev = vec3(real(0.5) * l[0] - mean, real(0.5) * l[1] - mean, real(0.5) * l[2] - mean)
         dh = wp.exp(-real(0.5) * d)
         vh = wp.exp(-real(0.5) * v)
-        y = real(2.0) * (dh * dh * dev + vh * vh * vec3(mean, mean, mean))
-        A = wp.transpose(Q) * adj_eps_half * Q
-        B = wp.transpose(Q) * adj_X_next * Q
-        for i in range(3):
-            for j in range(3):
-                B[i, j] = real(2.0) * exp_slope(y[i], y[j]) * B[i, j]
+        df = dh * dh
+        vf = vh * vh
+        # ln(1 + next) and its root
+        y = vec3(
+            real(2.0) * (df * dev[0] + vf * mean),
+            real(2.0) * (df * dev[1] + vf * mean),
+            real(2.0) * (df * dev[2] + vf * mean),
+        )
+        root = vec3(wp.exp(real(0.5) * y[0]), wp.exp(real(0.5) * y[1]), wp.exp(real(0.5) * y[2]))
+        Qt = wp.transpose(Q)
+        A = Qt * (adj_tau * Q)
+        B = Qt * (adj_X_next * Q)
         a = wp.get_diag(A)
-        b = wp.get_diag(B)
+        b = real(2.0) * vec3(root[0] * root[0] * B[0, 0], root[1] * root[1] * B[1, 1], root[2] * root[2] * B[2, 2])
         a_sum = a[0] + a[1] + a[2]
         b_sum = b[0] + b[1] + b[2]
-        wp.adjoint[d] += -real(0.5) * dh * wp.dot(dev, a) - dh * dh * wp.dot(dev, b)
-        wp.adjoint[v] += -real(0.5) * vh * mean * a_sum - vh * vh * mean * b_sum
-        trace = ((vh - dh) * a_sum + (vh * vh - dh * dh) * b_sum) / real(3.0)
-        T = dh * A + dh * dh * B + trace * wp.identity(n=3, dtype=real)
+        shear = real(2.0) * mu * dh
+        adj_mean = K * vh * a_sum + (vf * b_sum - shear * a_sum - df * b_sum) / real(3.0)
+        T = mat33()
         for i in range(3):
-            for j in range(3):
-                T[i, j] = real(0.5) * log_slope(x[i], x[j]) * T[i, j]
-        G = Q * T * wp.transpose(Q)
-        wp.adjoint[X] += real(0.5) * (G + wp.transpose(G))
+            T[i, i] = real(0.5) * (shear * a[i] + df * b[i] + adj_mean) / wp.max(real(1.0) + x[i], floor)
+        for i in range(3):
+            j = (i + 1) % 3
+            slope = real(0.5) * log_slope(x[i], x[j], l[i], l[j])
+            exp_ij = exp_slope(y[i], y[j], root[i], root[j])
+            T_ij = slope * (real(0.5) * shear * (A[i, j] + A[j, i]) + df * exp_ij * (B[i, j] + B[j, i]))
+            T[i, j] = T_ij
+            T[j, i] = T_ij
+        dev_a = wp.dot(dev, a)
+        dev_b = wp.dot(dev, b)
+        return (
+            Q * (T * Qt),
+            real(2.0) * dh * dev_a,
+            real(3.0) * vh * mean * a_sum,
+            -real(0.5) * shear * dev_a - df * dev_b,
+            -real(1.5) * K * vh * mean * a_sum - vf * mean * b_sum,
+        )
 
-    return relax
+    return adjoint
+
+
+@functools.cache
+def maxwell_hencky(real: type) -> wp.Function:
+    """One step of a Hencky spring in series with a dash-pot, from the carried strain X = b - I.
+
+        maxwell(X, mu, K, d, v) -> (tau, X_next)      d, v = dt / relaxation time of the deviator and the trace
+        tau    = 2 mu e^{-d/2} dev eps + K e^{-v/2} tr(eps) I,   eps = 1/2 ln(I + X)             [Pa], as mu and K
+        X_next = exp(2 (e^{-d} dev eps + e^{-v} tr(eps)/3 I)) - I
+
+    Relaxation enters as expm1, so a slow one is an exact small increment of X and none leaves X as it is. Principal
+    values of I + X below 1e-5 (compression to 0.3 %) go on along the tangent of the logarithm. `without_replay`.
+    """
+    mat33 = matrix_type(real)
+    relax, adjoint = _relax(real), _adjoint_of_relax(real)
+
+    @wp.func(name=f"maxwell_hencky_{real.__name__}")
+    def maxwell(X: mat33, mu: real, K: real, d: real, v: real):
+        tau, X_next = relax(X, mu, K, d, v)
+        return tau, X_next
+
+    @wp.func_grad(maxwell)
+    def adj_maxwell(X: mat33, mu: real, K: real, d: real, v: real, adj_tau: mat33, adj_X_next: mat33):
+        adj_X, adj_mu, adj_K, adj_d, adj_v = adjoint(X, mu, K, d, v, adj_tau, adj_X_next)
+        wp.adjoint[X] += adj_X
+        wp.adjoint[mu] += adj_mu
+        wp.adjoint[K] += adj_K
+        wp.adjoint[d] += adj_d
+        wp.adjoint[v] += adj_v
+
+    return without_replay(maxwell)
+
+
+@functools.cache
+def relax_hencky(real: type) -> wp.Function:
+    """relax(X, d, v) -> (e^{-d/2} dev eps + e^{-v/2} tr(eps)/3 I, X_next): `maxwell_hencky` of 2 mu = 3 K = 1, whose
+    results may enter further functions."""
+    mat33 = matrix_type(real)
+    relax, adjoint = _relax(real), _adjoint_of_relax(real)
+    mu, K = real(1 / 2), real(1 / 3)
+
+    @wp.func(name=f"relax_hencky_{real.__name__}")
+    def relax_hencky(X: mat33, d: real, v: real):
+        eps_half, X_next = relax(X, mu, K, d, v)
+        return eps_half, X_next
+
+    @wp.func_grad(relax_hencky)
+    def adj_relax_hencky(X: mat33, d: real, v: real, adj_eps_half: mat33, adj_X_next: mat33):
+        adj_X, _mu, _K, adj_d, adj_v = adjoint(X, mu, K, d, v, adj_eps_half, adj_X_next)
+        wp.adjoint[X] += adj_X
+        wp.adjoint[d] += adj_d
+        wp.adjoint[v] += adj_v
+
+    return relax_hencky

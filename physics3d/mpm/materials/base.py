@@ -69,7 +69,8 @@ class AbstractMaterial(abc.ABC):
                     memory_next: array2d[m, n]) -> (H_next: mat33, tau: mat33)
 
         It reads column p of coefficients and memory, writes all rows of column p of memory_next, and has an exact
-        adjoint. dt = 0 and L = 0 give the rate-independent stress of the present state.
+        adjoint. dt = 0 and L = 0 give the rate-independent stress of the present state. The adjoint of a kernel does
+        not evaluate it again (`spectral.without_replay`), so a kernel does nothing with the two results but store them.
         """
 
 
@@ -104,7 +105,7 @@ def store_strain(real: type) -> wp.Function:
         memory_next[row + 4, p] = X[1, 2]
         memory_next[row + 5, p] = X[2, 2]
 
-    return store
+    return spectral.without_replay(store)
 
 
 def log_strain(memory: Float[Tensor, "6 n"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:

@@ -78,4 +78,4 @@ def _advance(real: type) -> wp.Function:
         tau = coefficients[0, p] * X + coefficients[1, p] * log_J * wp.identity(n=3, dtype=real)
         return H_next, tau
 
-    return advance
+    return spectral.without_replay(advance)

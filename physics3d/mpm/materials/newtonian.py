@@ -81,4 +81,4 @@ def _advance(real: type) -> wp.Function:
         eta = coefficients[1, p] * wp.pow(g2, real(0.5) * (coefficients[2, p] - real(1.0)))
         return H + M + M * H, coefficients[0, p] * J * j * one + real(2.0) * eta * wp.max(J, real(0.0)) * D
 
-    return advance
+    return spectral.without_replay(advance)

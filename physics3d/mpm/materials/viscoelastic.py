@@ -47,8 +47,8 @@ class Viscoelastic(base.AbstractMaterial):
     def __post_init__(self) -> None:
         if self.branches not in (0, 1, 2, 3):
             raise ValueError(f"branches is {self.branches}; take 0, 1, 2 or 3")
-        if self.spring not in _RELAX:
-            raise ValueError(f"spring is {self.spring!r}; take one of {sorted(_RELAX)}")
+        if self.spring not in _MAXWELL:
+            raise ValueError(f"spring is {self.spring!r}; take one of {sorted(_MAXWELL)}")
         if not self.elastic and not self.branches:
             raise ValueError(
                 "elastic is False and branches is 0: no stress is defined; take branches >= 1 or elastic=True"
@@ -135,23 +135,9 @@ _BRANCH = ("branch_shear_modulus", "branch_bulk_modulus", "shear_viscosity_time"
 
 
 @functools.cache
-def _hencky(real: type) -> wp.Function:
-    """maxwell(X, mu, K, d, v) -> (stress of the half-relaxed strain, relaxed X); d, v = dt / relaxation time."""
-    mat33 = spectral.matrix_type(real)
-    relax = spectral.relax_hencky(real)
-
-    @wp.func(name=f"maxwell_hencky_{real.__name__}")
-    def maxwell(X: mat33, mu: real, K: real, d: real, v: real):
-        eps, X_next = relax(X, d, v)
-        lam = K - real(2.0) * mu / real(3.0)
-        return real(2.0) * mu * eps + lam * wp.trace(eps) * wp.identity(n=3, dtype=real), X_next
-
-    return maxwell
-
-
-@functools.cache
 def _neo_hookean(real: type) -> wp.Function:
-    """As `_hencky`. b~ = I + B, b~^-1 = I + W; W/(1 + s) is W relaxed before it is scaled to determinant one."""
+    """As `spectral.maxwell_hencky`. b~ = I + B, b~^-1 = I + W; W/(1 + s) is W relaxed before it is scaled to
+    determinant one."""
     mat33 = spectral.matrix_type(real)
     log_det, expm1 = spectral.log_det(real), spectral.expm1(real)
     unimodular_inverse = spectral.unimodular_inverse(real)
@@ -171,23 +157,47 @@ def _neo_hookean(real: type) -> wp.Function:
     return maxwell
 
 
-_RELAX = {"hencky": _hencky, "neo_hookean": _neo_hookean}
+_MAXWELL = {"hencky": spectral.maxwell_hencky, "neo_hookean": _neo_hookean}
 
 
 @functools.cache
-def _advance(branches: int, elastic: bool, spring: str, real: type) -> wp.Function:
+def _corotated(real: type) -> wp.Function:
+    """corotated(H, mu, lam) -> stress of the elastic branch."""
     mat33 = spectral.matrix_type(real)
-    volume_change, stretch = spectral.volume_change(real), spectral.stretch(real)
-    maxwell = _RELAX[spring](real)
-    carried, store = base.carried_strain(real), base.store_strain(real)
-    key = f"{branches}_{'elastic' if elastic else 'viscous'}_{spring}_{real.__name__}"
-    first = 2 if elastic else 0
+    volume_change, cofactor = spectral.volume_change(real), spectral.cofactor(real)
+    stretch, adjoint_of_stretch = spectral.stretch(real), spectral.adjoint_of_stretch(real)
 
     @wp.func(name=f"corotated_{real.__name__}")
     def corotated(H: mat33, mu: real, lam: real):
         Y = stretch(H)
         j = volume_change(H)
         return real(2.0) * mu * (Y + Y * Y) + lam * (real(1.0) + j) * j * wp.identity(n=3, dtype=real)
+
+    @wp.func_grad(corotated)
+    def adj_corotated(H: mat33, mu: real, lam: real, adj_ret: mat33):
+        one = wp.identity(n=3, dtype=real)
+        Y = stretch(H)
+        j = volume_change(H)
+        A = real(0.5) * (adj_ret + wp.transpose(adj_ret))
+        AY = A * Y
+        trace = wp.trace(A)
+        F = one + H
+        adj_Y = real(2.0) * mu * (A + AY + wp.transpose(AY))
+        wp.adjoint[H] += adjoint_of_stretch(F, one + Y, adj_Y) + lam * (real(1.0) + real(2.0) * j) * trace * cofactor(F)
+        wp.adjoint[mu] += real(2.0) * (wp.trace(AY) + wp.ddot(AY, Y))
+        wp.adjoint[lam] += (real(1.0) + j) * j * trace
+
+    return spectral.without_replay(corotated)
+
+
+@functools.cache
+def _advance(branches: int, elastic: bool, spring: str, real: type) -> wp.Function:
+    mat33 = spectral.matrix_type(real)
+    corotated = _corotated(real)
+    maxwell = _MAXWELL[spring](real)
+    carried, store = base.carried_strain(real), base.store_strain(real)
+    key = f"{branches}_{'elastic' if elastic else 'viscous'}_{spring}_{real.__name__}"
+    first = 2 if elastic else 0
 
     @wp.func(name=f"viscoelastic_{key}")
     def advance(
@@ -204,7 +214,6 @@ def _advance(branches: int, elastic: bool, spring: str, real: type) -> wp.Functi
         tau = mat33()
         if wp.static(elastic):
             tau = tau + corotated(H_next, coefficients[0, p], coefficients[1, p])
-        # unrolled, and flat: each nested function would be evaluated once more in the adjoint
         for i in range(wp.static(branches)):
             k = first + 4 * i
             d, v = dt * coefficients[k + 2, p], dt * coefficients[k + 3, p]
@@ -213,4 +222,4 @@ def _advance(branches: int, elastic: bool, spring: str, real: type) -> wp.Functi
             tau = tau + tau_N
         return H_next, tau
 
-    return advance
+    return spectral.without_replay(advance)

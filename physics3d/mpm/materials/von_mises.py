@@ -102,4 +102,4 @@ def _advance(real: type) -> wp.Function:
         tau = real(2.0) * mu * wp.exp(-shrink) * (eps - mean * one) + real(3.0) * coefficients[1, p] * mean * one
         return H + M + M * H, tau
 
-    return advance
+    return spectral.without_replay(advance)
