@@ -372,23 +372,65 @@ def eigen(real: type) -> wp.Function:
     return eigen
 
 
+_FLOOR = 1e-5  # principal values of I + X below it (compression to 0.3 %) go on along the tangent of the logarithm
+
+
 @functools.cache
-def _relax_near_identity(real: type) -> wp.Function:
-    """`_relax` for |X| < 0.4 without eigenvectors: both results are quadratic polynomials of B (see `eigen`) through the
-    values at three nodes t_i. The error is p^3 prod(t - t_i) times a third derivative: an uncertain node costs little,
-    and two that would coincide may be held apart."""
+def _relax_by_eigenvectors(real: type) -> wp.Function:
+    """`_relax` at any strain."""
+    mat33 = matrix_type(real)
+    vec3 = wp.types.vector(3, real)
+    eigen_, expm1_, log1p_ = eigen(real), expm1(real), log1p_extended(real, _FLOOR)
+    floor = real(_FLOOR)
+
+    @wp.func(name=f"relax_by_eigenvectors_{real.__name__}")
+    def relax(X: mat33, mu: real, K: real, d: real, v: real):
+        x, Q = eigen_(X)
+        eps = real(0.5) * vec3(log1p_(x[0]), log1p_(x[1]), log1p_(x[2]))
+        mean = (eps[0] + eps[1] + eps[2]) / real(3.0)
+        dh = expm1_(-real(0.5) * d)
+        vh = expm1_(-real(0.5) * v)
+        shear = real(2.0) * mu * (real(1.0) + dh)
+        pressure = real(3.0) * K * (real(1.0) + vh) * mean
+        df = real(2.0) * dh * (real(2.0) + dh)  # 2 expm1(-d)
+        vf = real(2.0) * vh * (real(2.0) + vh) * mean
+        stress = vec3()
+        change = vec3()
+        for i in range(3):
+            dev = eps[i] - mean
+            stress[i] = shear * dev + pressure
+            before = x[i]
+            if real(1.0) + x[i] < floor:
+                before = wp.exp(real(2.0) * eps[i]) - real(1.0)
+            change[i] = (real(1.0) + before) * expm1_(df * dev + vf) + before - x[i]
+        Qt = wp.transpose(Q)
+        return Q * wp.diag(stress) * Qt, X + Q * wp.diag(change) * Qt
+
+    return relax
+
+
+@functools.cache
+def _relax(real: type) -> wp.Function:
+    """The forward function of `maxwell_hencky` and `relax_hencky`.
+
+    Unless stretches are very unequal, no eigenvectors: both results are quadratic polynomials of B (see `eigen`)
+    through the values at three nodes t_i. The error is p^3 prod(t - t_i) times a third derivative, of the order of
+    prod(t - t_i) as long as p is below every 1 + x: an uncertain node costs little, and two may be held apart.
+    """
     mat33 = matrix_type(real)
     expm1_, log1p_ = expm1(real), log1p(real)
-    separated_root = _separated_root(real, 0 if real is wp.float32 else 2)
+    separated_root = _separated_root(real, 1 if real is wp.float32 else 2)
+    relax_by_eigenvectors = _relax_by_eigenvectors(real)
     least = real(1e-18 if real is wp.float32 else 1e-150)
-    apart = real(4e-6 if real is wp.float32 else 4e-16)
+    third = real(1 / 3)
+    apart = real(1e-6 if real is wp.float32 else 4e-16)
 
-    @wp.func(name=f"relax_near_identity_{real.__name__}")
+    @wp.func(name=f"relax_{real.__name__}")
     def relax(X: mat33, mu: real, K: real, d: real, v: real):
-        m = (X[0, 0] + X[1, 1] + X[2, 2]) / real(3.0)
+        m = third * (X[0, 0] + X[1, 1] + X[2, 2])
         a, b, c = X[0, 0] - m, X[1, 1] - m, X[2, 2] - m
         f, g, h = X[1, 2], X[0, 2], X[0, 1]
-        p = wp.sqrt((a * a + b * b + c * c + real(2.0) * (f * f + g * g + h * h)) / real(6.0))
+        p = wp.sqrt(third * (real(0.5) * (a * a + b * b + c * c) + f * f + g * g + h * h))
         scale = real(1.0) / wp.max(p, least)
         a, b, c = scale * a, scale * b, scale * c
         f, g, h = scale * f, scale * g, scale * h
@@ -399,8 +441,11 @@ def _relax_near_identity(real: type) -> wp.Function:
         t2 = -real(0.5) * t0 - r
         # values
         x0, x1, x2 = m + p * t0, m + p * t1, m + p * t2
+        if real(1.0) + wp.min(x0, wp.min(x1, x2)) < wp.max(p, real(0.1)):
+            far_tau, far_X = relax_by_eigenvectors(X, mu, K, d, v)
+            return far_tau, far_X
         e0, e1, e2 = real(0.5) * log1p_(x0), real(0.5) * log1p_(x1), real(0.5) * log1p_(x2)
-        mean = (e0 + e1 + e2) / real(3.0)
+        mean = third * (e0 + e1 + e2)
         dh = expm1_(-real(0.5) * d)
         vh = expm1_(-real(0.5) * v)
         df = real(2.0) * dh * (real(2.0) + dh)  # 2 expm1(-d)
@@ -409,7 +454,8 @@ def _relax_near_identity(real: type) -> wp.Function:
         n1 = (real(1.0) + x1) * expm1_(df * (e1 - mean) + vf)
         n2 = (real(1.0) + x2) * expm1_(df * (e2 - mean) + vf)
         # divided differences
-        r01, r02, r12 = real(1.0) / (t0 - t1), real(1.0) / (t0 - t2), real(0.5) / r
+        both = real(1.0) / ((t0 - t1) * (t0 - t2))
+        r01, r02, r12 = both * (t0 - t2), both * (t0 - t1), real(0.5) / r
         e01, n01 = (e0 - e1) * r01, (n0 - n1) * r01
         e012 = (e01 - (e0 - e2) * r02) * r12
         n012 = (n01 - (n0 - n2) * r02) * r12
@@ -432,47 +478,6 @@ def _relax_near_identity(real: type) -> wp.Function:
             mat33(tau_a, tau_h, tau_g, tau_h, tau_b, tau_f, tau_g, tau_f, tau_c),
             mat33(x_a, x_h, x_g, x_h, x_b, x_f, x_g, x_f, x_c),
         )
-
-    return relax
-
-
-_FLOOR = 1e-5  # principal values of I + X below it (compression to 0.3 %) go on along the tangent of the logarithm
-
-
-@functools.cache
-def _relax(real: type) -> wp.Function:
-    """The forward function of `maxwell_hencky` and `relax_hencky`."""
-    mat33 = matrix_type(real)
-    vec3 = wp.types.vector(3, real)
-    eigen_, expm1_, log1p_ = eigen(real), expm1(real), log1p_extended(real, _FLOOR)
-    floor = real(_FLOOR)
-    relax_near_identity = _relax_near_identity(real)
-
-    @wp.func(name=f"relax_{real.__name__}")
-    def relax(X: mat33, mu: real, K: real, d: real, v: real):
-        if wp.ddot(X, X) < real(0.16):
-            near_tau, near_X = relax_near_identity(X, mu, K, d, v)
-            return near_tau, near_X
-        x, Q = eigen_(X)
-        eps = real(0.5) * vec3(log1p_(x[0]), log1p_(x[1]), log1p_(x[2]))
-        mean = (eps[0] + eps[1] + eps[2]) / real(3.0)
-        dh = expm1_(-real(0.5) * d)
-        vh = expm1_(-real(0.5) * v)
-        shear = real(2.0) * mu * (real(1.0) + dh)
-        pressure = real(3.0) * K * (real(1.0) + vh) * mean
-        df = real(2.0) * dh * (real(2.0) + dh)  # 2 expm1(-d)
-        vf = real(2.0) * vh * (real(2.0) + vh) * mean
-        stress = vec3()
-        change = vec3()
-        for i in range(3):
-            dev = eps[i] - mean
-            stress[i] = shear * dev + pressure
-            before = x[i]
-            if real(1.0) + x[i] < floor:
-                before = wp.exp(real(2.0) * eps[i]) - real(1.0)
-            change[i] = (real(1.0) + before) * expm1_(df * dev + vf) + before - x[i]
-        Qt = wp.transpose(Q)
-        return Q * wp.diag(stress) * Qt, X + Q * wp.diag(change) * Qt
 
     return relax
 
