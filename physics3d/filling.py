@@ -3,7 +3,8 @@
 A reconstruction puts Gaussians on the visible surface only; a simulated body needs mass behind it.
 
     samples    every Gaussian above the opacity threshold, spread over its disc, without floaters
-    normals    least axis of the local covariance; outward is the side from which more of the sky is seen
+    normals    least axis of the local covariance; outward is the side from which more of the sky is seen (what the body
+               stands on or leans against hides the sky)
     thin       both sides see the sky alike (a petal, a leaf); such samples bound no volume
     inside     of the closed surface through the remaining samples (`Poisson`), or by `WindingNumber`
     particles  one per lattice cell of that volume, at the centroid of the part inside, V_p = its measure [m^3];
@@ -33,7 +34,7 @@ from physics3d.open3d_import import open3d
 DIRECTIONS = np.array(
     [d for d in itertools.product((-1, 0, 1), repeat=3) if any(d)]
 )  # [26, 3], towards voxel neighbours
-MOST_CELLS = 400  # along one side of the lattice
+MOST_CELLS = 160  # along one side of the lattice
 LEAST_FRACTION = 0.25  # a cell filled less than this is no particle of its own
 SUBDIVISION = 4  # samples along each side of a boundary cell
 
@@ -242,7 +243,8 @@ def fill(
         )
 
     shown = moving.select(reliable)
-    surface, deviation = sample_surface(shown, spacing)
+    static = gaussians.select((label == 0) & (gaussians.opacity > opacity))
+    surface, deviation = sample_surface(shown, spacing, beside=static)
     position, volume = solid_cells(solid.inside(surface, spacing), surface.point, spacing)
     distance, _ = cKDTree(surface.point).query(position) if len(position) else (np.zeros(0), None)
     inner = distance > spacing
@@ -296,13 +298,11 @@ def without_floaters(point: np.ndarray) -> np.ndarray:
     return np.asarray(kept, dtype=np.int64)
 
 
-def sample_surface(gaussians: Gaussians, spacing: float) -> tuple[Surface, np.ndarray]:
-    """Samples at most half a spacing apart over one deviation of every disc, and the least deviation [m] at each."""
-    step = spacing / 2
+def spread(gaussians: Gaussians, step: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points [k, 3] [m] at most `step` apart over one deviation of every disc, and the Gaussian [k] that each is of."""
     scale, order = torch.exp(gaussians.log_scale.double()).sort(dim=1)
     axes = torch.gather(gaussians.rotation().double(), 2, order[:, None, :].expand(-1, 3, -1)).numpy()
     scale, mean = scale.numpy(), gaussians.mean.double().numpy()
-
     points, owners = [], []
     counts = np.clip(2 * np.ceil(scale[:, 1:] / step - 0.5).astype(int) + 1, 1, 25)  # odd, so that the centre is one
     for a, b in np.unique(counts, axis=0):
@@ -313,10 +313,25 @@ def sample_surface(gaussians: Gaussians, spacing: float) -> tuple[Surface, np.nd
         second = t[:, None] * (scale[at, 2, None] * axes[at, :, 2])[:, None, :]
         points.append((mean[at, None, :] + first + second).reshape(-1, 3))
         owners.append(np.repeat(at, len(s)))
-    point, owner = np.concatenate(points), np.concatenate(owners)
+    return np.concatenate(points), np.concatenate(owners)
 
+
+def sample_surface(gaussians: Gaussians, spacing: float, beside: Gaussians | None = None) -> tuple[Surface, np.ndarray]:
+    """Samples about half a spacing apart, and the least deviation [m] of the Gaussians at each.
+
+    `beside` are Gaussians that do not belong to the body but hide the sky: what it stands on or leans against.
+    """
+    step = spacing / 2
+    point, owner = spread(gaussians, step)
     gap = np.quantile(cKDTree(point).query(point, k=2)[0][:, 1], 0.95)
-    enclosure = Enclosure(point, max(0.75 * spacing, 1.5 * gap))
+    h = max(0.75 * spacing, 1.5 * gap)
+    walls = point
+    if beside is not None and len(beside):
+        reach = 0.25 * np.ptp(point, 0).max()
+        around, _ = spread(beside, h)
+        near = ((around > point.min(0) - reach) & (around < point.max(0) + reach)).all(1)
+        walls = np.concatenate([point, around[near]])
+    enclosure = Enclosure(walls, h)
 
     # one sample per voxel of half a spacing: the mean of what lies in it
     _, group = np.unique(np.floor(point / step).astype(np.int64), axis=0, return_inverse=True)
@@ -324,7 +339,7 @@ def sample_surface(gaussians: Gaussians, spacing: float) -> tuple[Surface, np.nd
     count = np.bincount(group).astype(float)
     average = lambda v: np.bincount(group, weights=v) / count
     point = np.stack([average(point[:, k]) for k in range(3)], 1)
-    deviation = average(scale[owner, 0])
+    deviation = average(torch.exp(gaussians.log_scale.double()).amin(1).numpy()[owner])
     shape = gaussians.covariance().double().numpy()[owner]
     shape = np.stack([average(shape[:, i, j]) for i in range(3) for j in range(3)], 1).reshape(-1, 3, 3)
 

@@ -37,10 +37,10 @@ class Segment:
         gaussians = gaussians.to(self.device)
 
         if capture.images:
-            every, views, maps = self._maps(capture, gaussians, parts, log)
+            every, views, maps, said = self._maps(capture, gaussians, parts, log)
             label = self._lift(gaussians, views, maps, parts)
             if self.prompts:
-                views, maps = every, self._refine(gaussians, label, every, parts, capture, log)
+                views, maps = every, self._refine(gaussians, label, every, parts, said, capture, log)
                 label = self._lift(gaussians, views, maps, parts)
             log.image("masks", contact_sheet([tinted(v.image, m.numpy()) for v, m in zip(views, maps)]))
             gaussians = gaussians.to("cpu")
@@ -79,8 +79,8 @@ class Segment:
 
     def _maps(
         self, capture: Capture, gaussians: Gaussians, parts: tuple[str, ...], log: Log
-    ) -> tuple[list[View], list[View], list[torch.Tensor]]:
-        """All views, those that could be masked, and for each of these a map of labels [h, w]."""
+    ) -> tuple[list[View], list[View], list[torch.Tensor], dict[tuple[str, int], np.ndarray]]:
+        """All views, those that could be masked, for each of these a map of labels [h, w], and the prompted masks."""
         if not self.prompts and not capture.alphas:
             raise ValueError(
                 f"segment.prompts is empty and {capture.name} has no mattes; say what moves, e.g. "
@@ -125,7 +125,8 @@ class Segment:
         if not kept or not any(bool(m.any()) for m in maps):
             raise ValueError(f"no view shows all of {', '.join(parts)}; prompt them in a view that shows them")
         log.info(f"{len(kept)} of {len(capture.images)} photographs masked")
-        return views, kept, maps
+        said = {(part, first): masks[part][first] for part, first in firsts.items()}
+        return views, kept, maps, said
 
     def _lift(self, gaussians: Gaussians, views: list[View], maps: list[torch.Tensor], parts: tuple[str, ...]):
         weights = contributions(gaussians, [v.camera for v in views], maps, 1 + len(parts))
@@ -138,12 +139,15 @@ class Segment:
                 label[(label == k) & ~allowed] = 0
         return label
 
-    def _refine(self, gaussians, label, views: list[View], parts: tuple[str, ...], capture: Capture, log: Log):
-        """Maps again, each view now prompted by what all views together say."""
+    def _refine(self, gaussians, label, views: list[View], parts: tuple[str, ...], said, capture: Capture, log: Log):
+        """Maps again, each view now prompted by what all views together say; what a person prompted stays."""
         maps = []
         for view in log.progress(views, "refining masks"):
             masks = []
-            for k in range(1, len(parts) + 1):
+            for k, part in enumerate(parts, 1):
+                if (part, view.index) in said:
+                    masks.append(said[part, view.index])
+                    continue
                 one = (label == k).to(gaussians.mean)[:, None].expand(-1, 3)
                 with torch.no_grad():
                     drawn = rasterize(

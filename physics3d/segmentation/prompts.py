@@ -3,7 +3,8 @@
 The masked pixels of the prompted view become points of the object, X = o + z(u, v) d(u, v) [m]; projected into the next
 view they give a box and, where the rendered depth there says that they are visible, positive points; the pixels
 around the object give negative ones in the same way. Views are taken in the order of their angle to the prompted
-one, and each adds the points that it shows, so that the far side is reached step by step.
+one, and each adds the points that it shows, so that the far side is reached step by step. What lies beyond a ball
+around the object is never part of it: prompt a view that shows the object at its largest.
 """
 
 from dataclasses import dataclass
@@ -99,6 +100,29 @@ class View:
         return uv.numpy(), seen.numpy()
 
 
+@dataclass(frozen=True)
+class Ball:
+    """Space that the object may take, judged from one view: hardly deeper than it is wide or high there."""
+
+    centre: Float[Tensor, " 3"]  # [m]
+    radius: float  # [m]
+
+    @classmethod
+    def around(cls, visible: Float[Tensor, "m 3"], camera: Camera) -> "Ball":
+        """From the surface that the camera sees; measured across the line of sight, without the outermost 2 %."""
+        R = camera.world_to_camera[:3, :3].to(visible)
+        low, high = np.quantile((visible @ R.T)[:, :2].numpy(), (0.02, 0.98), axis=0)
+        size = float(np.linalg.norm(high - low))
+        return cls(visible.median(0).values + 0.2 * size * R[2], 0.75 * size)
+
+    def excludes(self, view: View) -> Bool[np.ndarray, "h w"]:
+        """Pixels whose surface is beyond the ball."""
+        beyond = np.zeros(view.image.shape[:2], bool)
+        point = view.points(~beyond)
+        beyond[(view.rendered.alpha > 0.5).numpy()] = ((point - self.centre).norm(dim=1) > self.radius).numpy()
+        return beyond
+
+
 def prompted_mask(prompts: tuple[Prompt, ...], others: tuple[Prompt, ...], view: View, masker: AbstractMasker):
     """Mask [h, w] of one part from its prompts in this view; what is positive for other parts is negative here.
 
@@ -127,6 +151,12 @@ def carry_masks(
     first: View, mask: Bool[np.ndarray, "h w"], views: list[View], masker: AbstractMasker, *, log: Log
 ) -> dict[int, Bool[np.ndarray, "h w"]]:
     """Masks by view index: the first one, and those of the other views that agree with the points carried to them."""
+    if not bool((first.rendered.alpha > 0.5).numpy()[mask].any()):
+        raise ValueError(
+            f"the mask in view {first.name} covers no opaque pixel of the reconstruction; prompt another view"
+        )
+    ball = Ball.around(first.points(eroded(mask, 2)), first.camera)
+    mask = mask & ~ball.excludes(first)
     masks = {first.index: mask}
     inside, outside = first.points(eroded(mask, 2)), first.points(eroded(~mask, 2))
     inside, outside = thinned(inside, MOST_CARRIED), thinned(outside, MOST_CARRIED)
@@ -147,12 +177,16 @@ def carry_masks(
         box = bounds(uv[seen], 0.3, view)
         around, clear = view.sees(outside)
         clear &= ((around >= box[:2]) & (around <= box[2:])).all(1)
+        beyond = ball.excludes(view)
+        pixels = np.argwhere(beyond)[:, ::-1] + 0.5
+        pixels = pixels[((pixels >= box[:2]) & (pixels <= box[2:])).all(1)]
         found = masker(
             view.image,
             box=box,
             positive=thinned(uv[seen], masker.most_points),
-            negative=thinned(around[clear], masker.most_points),
+            negative=np.concatenate([thinned(p, masker.most_points // 2) for p in (around[clear], pixels)]),
         )
+        found &= ~beyond
         recall, leak = share_within(found, uv[seen]), share_within(found, around[clear])
         if recall < 0.6 or leak > 0.3:
             log.info(
