@@ -359,7 +359,10 @@ def sample_surface(gaussians: Gaussians, spacing: float, beside: Gaussians | Non
     front, back = sky
     normal = np.where((front >= back)[:, None], normal, -normal)
     more, less = np.maximum(front, back), np.minimum(front, back)
-    return Surface(point, normal, enclosure, thin=(less > 0.6 * more) & (more > 0.02), hidden=more <= 0.02), deviation
+    thin, hidden = (less > 0.6 * more) & (more > 0.02), more <= 0.02
+    # what is seen of a fitted Gaussian is its outer side, a deviation away from its centre
+    outward = np.where(thin | hidden, 0.0, deviation)[:, None] * normal
+    return Surface(point + outward, normal, enclosure, thin=thin, hidden=hidden), deviation
 
 
 def solid_cells(

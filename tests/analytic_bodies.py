@@ -10,9 +10,10 @@ from physics3d.scenes.base import Capture
 
 
 def discs(point, normal, rng, *, sigma=0.0015, thickness=0.0003, noise=0.0, color=(0.5, 0.5, 0.5)) -> Gaussians:
-    """One flat Gaussian per point; which side its least axis points to is random, as in a reconstruction."""
+    """One flat Gaussian per point of the surface, whose outer side lies on it; which side its least axis points to is
+    random, as in a reconstruction."""
     n = len(point)
-    point = point + noise * rng.normal(size=point.shape)
+    point = point - thickness * normal + noise * rng.normal(size=point.shape)
     normal = normal * rng.choice([-1, 1], n)[:, None]
     quaternion = np.concatenate([1 + normal[:, 2:], np.cross([0.0, 0.0, 1.0], normal)], 1)
     quaternion[1 + normal[:, 2] < 1e-6] = (0, 1, 0, 0)

@@ -13,7 +13,7 @@ SOIL = 0.072  # height of the soil [m]
 STEM_TOP = 0.190  # height where the calyx begins [m]
 STEM_RADIUS = (0.0130, 0.0112)  # at the soil and at the top [m]
 BLOOM = (0.042, 0.034)  # half width and height of the visible blossom [m]
-DOME = (0.034, 0.026)  # the same of the space that is densely filled with petals [m]
+DOME = (0.040, 0.031)  # the same of the space that the petals fill, all but their frills [m]
 PETALS = 52
 GOLDEN = np.pi * (3 - 5**0.5)
 # position along the stem, azimuth [rad], length [m]
