@@ -14,7 +14,7 @@ from physics3d.segmentation import Segmentation
 from physics3d.segmentation.lift import contributions, islands, lift, touching
 from physics3d.segmentation.masks import AbstractMasker, GrabCut
 from physics3d.segmentation.previews import contact_sheet, tinted
-from physics3d.segmentation.prompts import Prompt, View, carry_masks, mask_of_box, prompted_mask, refined_mask
+from physics3d.segmentation.prompts import Ball, Prompt, View, carry_masks, mask_of_box, prompted_mask, refined_mask
 
 LEAST_PIXELS = 20  # a mask smaller than this is no mask
 
@@ -37,11 +37,13 @@ class Segment:
         gaussians = gaussians.to(self.device)
 
         if capture.images:
-            every, views, maps, said = self._maps(capture, gaussians, parts, log)
-            label = self._lift(gaussians, views, maps, parts)
+            said, balls = self._prompted(capture, gaussians, parts)
+            every = self._views(capture, gaussians, said, balls, log)
+            views, maps = self._maps(capture, every, parts, said, balls, log)
+            label = self._lift(gaussians, views, maps, parts, balls)
             if self.prompts:
-                views, maps = every, self._refine(gaussians, label, every, parts, said, capture, log)
-                label = self._lift(gaussians, views, maps, parts)
+                views, maps = every, self._refine(gaussians, label, every, parts, said, balls, capture, log)
+                label = self._lift(gaussians, views, maps, parts, balls)
             log.image("masks", contact_sheet([tinted(v.image, m.numpy()) for v, m in zip(views, maps)]))
             gaussians = gaussians.to("cpu")
         else:
@@ -77,36 +79,40 @@ class Segment:
                 target[: labelled.shape[0], : labelled.shape[1]] = labelled.to(torch.uint8)
         return Segmentation(label=label, parts=parts, masks=masks, mask_views=tuple(v.index for v in views))
 
-    def _maps(
-        self, capture: Capture, gaussians: Gaussians, parts: tuple[str, ...], log: Log
-    ) -> tuple[list[View], list[View], list[torch.Tensor], dict[tuple[str, int], np.ndarray]]:
-        """All views, those that could be masked, for each of these a map of labels [h, w], and the prompted masks."""
+    def _prompted(
+        self, capture: Capture, gaussians: Gaussians, parts: tuple[str, ...]
+    ) -> tuple[dict[str, tuple[View, np.ndarray]], dict[str, Ball]]:
+        """For each part that is prompted in an image: that view with its mask, and the space that the part may take."""
         if not self.prompts and not capture.alphas:
             raise ValueError(
                 f"segment.prompts is empty and {capture.name} has no mattes; say what moves, e.g. "
                 "prompts=[{view: 0, box: [0.3, 0.2, 0.7, 0.8]}] in fractions of width and height"
             )
-        firsts = {p.part: _index(capture, p.view) for p in self.prompts if p.in_image}
-        chosen = self._spread(capture, gaussians, tuple(firsts.values()))
-        views = [self._view(capture, gaussians, i) for i in log.progress(chosen, "rendering depth")]
-        by_index = {v.index: v for v in views}
+        said, balls = {}, {}
+        in_image = [(p, _index(capture, p.view)) for p in self.prompts if p.in_image]
+        for part in parts:
+            where = {index for p, index in in_image if p.part == part}
+            if not where:
+                continue
+            if len(where) > 1:
+                raise ValueError(f"the prompts of {part!r} are in several views; give those of one part in one view")
+            view = self._view(capture, gaussians, where.pop())
+            here = [p for p, index in in_image if index == view.index]
+            own, others = (tuple(p for p in here if (p.part == part) == same) for same in (True, False))
+            mask = prompted_mask(own, others, view, self.masker)
+            balls[part] = Ball.around(view, mask)
+            said[part] = view, mask
+        return said, balls
 
+    def _maps(
+        self, capture: Capture, views: list[View], parts: tuple[str, ...], said, balls: dict[str, Ball], log: Log
+    ) -> tuple[list[View], list[torch.Tensor]]:
+        """The views that could be masked, and for each a map of labels [h, w]."""
         masks: dict[str, dict[int, np.ndarray]] = {}
         for part in parts:
             own = tuple(p for p in self.prompts if p.part == part)
-            in_image = tuple(p for p in own if p.in_image)
-            if in_image:
-                first = by_index[firsts[part]]
-                here = tuple(p for p in in_image if _index(capture, p.view) == first.index)
-                if len(here) < len(in_image):
-                    raise ValueError(
-                        f"the prompts of {part!r} are in several views; give those of one part in one view"
-                    )
-                others = tuple(
-                    p for p in self.prompts if p.part != part and p.in_image and _index(capture, p.view) == first.index
-                )
-                mask = prompted_mask(here, others, first, self.masker)
-                masks[part] = carry_masks(first, mask, views, self.masker, log=log)
+            if part in said:
+                masks[part] = carry_masks(*said[part], balls[part], views, self.masker, log=log)
             elif own:
                 found = {v.index: mask_of_box(own[0], v, self.masker) for v in log.progress(views, "masking the box")}
                 masks[part] = {i: m for i, m in found.items() if m is not None}
@@ -125,10 +131,10 @@ class Segment:
         if not kept or not any(bool(m.any()) for m in maps):
             raise ValueError(f"no view shows all of {', '.join(parts)}; prompt them in a view that shows them")
         log.info(f"{len(kept)} of {len(capture.images)} photographs masked")
-        said = {(part, first): masks[part][first] for part, first in firsts.items()}
-        return views, kept, maps, said
+        return kept, maps
 
-    def _lift(self, gaussians: Gaussians, views: list[View], maps: list[torch.Tensor], parts: tuple[str, ...]):
+    def _lift(self, gaussians, views: list[View], maps: list[torch.Tensor], parts: tuple[str, ...], balls):
+        """Label int32 [n]; nothing outside a part's box in space or its ball belongs to it."""
         weights = contributions(gaussians, [v.camera for v in views], maps, 1 + len(parts))
         mean = gaussians.mean.cpu()
         label = lift(mean, weights)
@@ -137,16 +143,20 @@ class Segment:
             if boxes:
                 allowed = torch.stack([p.within(mean) for p in boxes]).any(0)
                 label[(label == k) & ~allowed] = 0
+            if part in balls:
+                label[(label == k) & ~balls[part].holds(mean)] = 0
         return label
 
-    def _refine(self, gaussians, label, views: list[View], parts: tuple[str, ...], said, capture: Capture, log: Log):
+    def _refine(
+        self, gaussians, label, views: list[View], parts: tuple[str, ...], said, balls, capture: Capture, log: Log
+    ) -> list[torch.Tensor]:
         """Maps again, each view now prompted by what all views together say; what a person prompted stays."""
         maps = []
         for view in log.progress(views, "refining masks"):
             masks = []
             for k, part in enumerate(parts, 1):
-                if (part, view.index) in said:
-                    masks.append(said[part, view.index])
+                if part in said and said[part][0].index == view.index:
+                    masks.append(said[part][1])
                     continue
                 one = (label == k).to(gaussians.mean)[:, None].expand(-1, 3)
                 with torch.no_grad():
@@ -158,17 +168,23 @@ class Segment:
                         view.camera,
                         background=(0, 0, 0),
                     )
-                masks.append(refined_mask(drawn.color[..., 0].cpu().numpy(), view, self.masker))
+                mask = refined_mask(drawn.color[..., 0].cpu().numpy(), view, self.masker)
+                masks.append(mask & ~balls[part].excludes(view) if part in balls else mask)
             maps.append(_labelled(masks, view, capture))
         return maps
 
-    def _spread(self, capture: Capture, gaussians: Gaussians, first: tuple[int, ...]) -> list[int]:
-        """The prompted views, and others spread evenly over the training photographs by farthest direction."""
+    def _views(self, capture: Capture, gaussians: Gaussians, said, balls: dict[str, Ball], log: Log) -> list[View]:
+        """The prompted views, and training photographs that show the parts whole, spread by farthest camera."""
         if self.views < 1:
             raise ValueError(f"segment.views is {self.views}, must be at least 1")
-        candidates = [i for i in range(len(capture.images)) if i not in capture.held_out or i in first]
+        first = list(dict.fromkeys(view.index for view, _ in said.values()))
+        training = [i for i in range(len(capture.images)) if i not in capture.held_out or i in first]
+        whole = [i for i in training if i in first or all(b.whole_in(capture.cameras[i]) for b in balls.values())]
+        candidates = whole if len(whole) >= min(self.views, 4) else training
+        if len(candidates) < len(training):
+            log.info(f"{len(candidates)} of {len(training)} photographs show the whole object")
         centres = torch.stack([capture.cameras[i].centre for i in candidates])
-        chosen = list(dict.fromkeys(first)) or [candidates[0]]
+        chosen = first or [candidates[0]]
         distance = torch.full((len(candidates),), torch.inf, dtype=torch.float64)
         for i in chosen:
             distance = torch.minimum(distance, (centres - capture.cameras[i].centre).norm(dim=1))
@@ -177,7 +193,7 @@ class Segment:
             chosen.append(candidates[k])
             distance = torch.minimum(distance, (centres - centres[k]).norm(dim=1))
             distance[k] = -1
-        return chosen
+        return [self._view(capture, gaussians, i) for i in log.progress(chosen, "rendering depth")]
 
     def _view(self, capture: Capture, gaussians: Gaussians, index: int) -> View:
         import cv2

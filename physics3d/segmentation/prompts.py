@@ -108,18 +108,43 @@ class Ball:
     radius: float  # [m]
 
     @classmethod
-    def around(cls, visible: Float[Tensor, "m 3"], camera: Camera) -> "Ball":
-        """From the surface that the camera sees; measured across the line of sight, without the outermost 2 %."""
-        R = camera.world_to_camera[:3, :3].to(visible)
-        low, high = np.quantile((visible @ R.T)[:, :2].numpy(), (0.02, 0.98), axis=0)
-        size = float(np.linalg.norm(high - low))
-        return cls(visible.median(0).values + 0.2 * size * R[2], 0.75 * size)
+    def around(cls, view: View, mask: Bool[np.ndarray, "h w"]) -> "Ball":
+        """From the masked surface; measured across the line of sight, without the outermost 2 %.
+
+        Raises ValueError if the reconstruction shows next to nothing there.
+        """
+        visible = view.points(eroded(mask, 2))
+        if len(visible) < 10:
+            raise ValueError(
+                f"the mask in view {view.name} covers only {len(visible)} opaque pixels of the reconstruction; "
+                "choose a view in which the object is large, or reconstruct longer"
+            )
+        M = view.camera.world_to_camera.to(visible)
+        low, mid, high = np.quantile((visible @ M[:3, :3].T + M[:3, 3]).numpy(), (0.02, 0.5, 0.98), axis=0)
+        size = float(np.linalg.norm((high - low)[:2]))
+        # the middle across the line of sight, and a little behind the surface that is seen
+        local = [*(0.5 * (low + high)[:2]).tolist(), float(mid[2]) + 0.2 * size]
+        return cls((torch.tensor(local).to(visible) - M[:3, 3]) @ M[:3, :3], 0.65 * size)
+
+    def whole_in(self, camera: Camera) -> bool:
+        """Does the camera see most of the ball? Its centre, and four fifths of the radius around it."""
+        uv, depth = self.centre_in(camera)
+        reach = 0.8 * self.radius * min(camera.fx, camera.fy) / max(depth, 1e-9)
+        return depth > self.radius and reach <= min(*uv, camera.width - uv[0], camera.height - uv[1])
+
+    def centre_in(self, camera: Camera) -> tuple[list[float], float]:
+        """Pixel and depth [m] of the centre."""
+        uv, depth = camera.project(self.centre[None])
+        return uv[0].tolist(), float(depth[0])
+
+    def holds(self, point: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
+        return (point - self.centre.to(point)).norm(dim=1) <= self.radius
 
     def excludes(self, view: View) -> Bool[np.ndarray, "h w"]:
         """Pixels whose surface is beyond the ball."""
         beyond = np.zeros(view.image.shape[:2], bool)
         point = view.points(~beyond)
-        beyond[(view.rendered.alpha > 0.5).numpy()] = ((point - self.centre).norm(dim=1) > self.radius).numpy()
+        beyond[(view.rendered.alpha > 0.5).numpy()] = (~self.holds(point)).numpy()
         return beyond
 
 
@@ -148,25 +173,14 @@ def prompted_mask(prompts: tuple[Prompt, ...], others: tuple[Prompt, ...], view:
 
 
 def carry_masks(
-    first: View, mask: Bool[np.ndarray, "h w"], views: list[View], masker: AbstractMasker, *, log: Log
+    first: View, mask: Bool[np.ndarray, "h w"], ball: Ball, views: list[View], masker: AbstractMasker, *, log: Log
 ) -> dict[int, Bool[np.ndarray, "h w"]]:
     """Masks by view index: the first one, and those of the other views that agree with the points carried to them."""
-    if not bool((first.rendered.alpha > 0.5).numpy()[mask].any()):
-        raise ValueError(
-            f"the mask in view {first.name} covers no opaque pixel of the reconstruction; prompt another view"
-        )
-    ball = Ball.around(first.points(eroded(mask, 2)), first.camera)
     mask = mask & ~ball.excludes(first)
     masks = {first.index: mask}
     inside, outside = first.points(eroded(mask, 2)), first.points(eroded(~mask, 2))
     inside, outside = thinned(inside, MOST_CARRIED), thinned(outside, MOST_CARRIED)
-    if len(inside) < 10:
-        raise ValueError(
-            f"the mask in view {first.name} covers only {len(inside)} opaque pixels of the reconstruction; "
-            "choose a view in which the object is large, or reconstruct longer"
-        )
-    centre = inside.median(0).values
-    towards = lambda view: torch.nn.functional.normalize(view.camera.centre.to(centre) - centre, dim=0)
+    towards = lambda view: torch.nn.functional.normalize(view.camera.centre.to(ball.centre) - ball.centre, dim=0)
     order = sorted((v for v in views if v.index != first.index), key=lambda v: -float(towards(v) @ towards(first)))
     for view in log.progress(order, "carrying the prompt"):
         uv, seen = view.sees(inside)
