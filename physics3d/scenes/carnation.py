@@ -43,7 +43,7 @@ class CarnationTwin(AbstractSource):
     youngs_modulus: float = 1.5e5  # of the elastic branch [Pa]
     poissons_ratio: float = 0.3
     branch_shear_modulus: float = 3.0e4  # mu_N [Pa]
-    branch_bulk_modulus: float = 4.0e4  # K_N [Pa]
+    branch_bulk_modulus: float = 6.5e4  # K_N, of the same Poisson ratio [Pa]
     shear_viscosity_time: float = 0.15  # 1/k_d [s]
     bulk_viscosity_time: float = 0.15  # 1/k_v [s]
     density: float = 300.0  # petals hold much air [kg/m^3]
