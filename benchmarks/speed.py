@@ -34,21 +34,25 @@ START = {
     "youngs_modulus": 1e5, "poissons_ratio": 0.3, "branch_shear_modulus": 2e4, "branch_bulk_modulus": 4e4,
     "shear_viscosity_time": 0.1, "bulk_viscosity_time": 0.1,
 }  # fmt: skip
-SUBSTEPS = {"cpu": 32, "cuda": 256}  # of the short run; the long one has four times as many
 
 
 def main(words: list[str]) -> None:
     options = dict(word.split("=", 1) for word in words)
     device, seed = options.get("device", "cpu"), int(options.get("seed", 0))
-    rows = []
-    for name, material in MATERIALS.items():
-        for count in (1_000, 10_000, 100_000, *((1_000_000,) if device.startswith("cuda") else ())):
-            rows += simulation(name, material, count, device, seed)
-            print(rows[-2:], flush=True)
-    for count, side in ((20_000, 320), (50_000, 400), *(((500_000, 800),) if device.startswith("cuda") else ())):
-        rows += rendering(count, side, device, seed)
-        print(rows[-2:], flush=True)
-    write(rows, device, seed)
+    cuda = device.startswith("cuda")
+    rows: list[dict] = []
+
+    def keep(more: list[dict]) -> None:
+        rows.extend(more)
+        for row in more:
+            print(f"{row['what']}, {row['size']}: {row['value']:.4g} {row['unit']}", flush=True)
+        write(rows, device, seed)
+
+    for count, side in ((20_000, 320), (50_000, 400), *(((500_000, 800),) if cuda else ())):
+        keep(rendering(count, side, device, seed))
+    for count in (10_000, 100_000, 1_000_000) if cuda else (1_000, 10_000, 100_000):
+        for name, material in MATERIALS.items():
+            keep(simulation(name, material, count, device, seed))
 
 
 def simulation(name: str, material, count: int, device: str, seed: int) -> list[dict]:
@@ -81,7 +85,9 @@ def simulation(name: str, material, count: int, device: str, seed: int) -> list[
         synchronise(device)
         return time.perf_counter() - start, motion.substeps
 
-    substep, substeps = 0.5 * dx / 20.0, SUBSTEPS[device.split(":")[0]]
+    # of the short run; the long one has four times as many
+    substeps = (256 if count < 1_000_000 else 64) if device.startswith("cuda") else 32
+    substep = 0.5 * dx / 20.0  # [s]; the run says how many it took
     frame_dt = substeps * substep
     rows = []
     for backward in (False, True):
