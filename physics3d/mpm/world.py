@@ -37,6 +37,7 @@ class World:
     start: dict[str, float]  # where the material's parameters start, SI
     dx: float  # grid spacing [m]
     gravity: Vector = (0.0, 0.0, -9.81)  # [m/s^2]
+    velocity: Vector = (0.0, 0.0, 0.0)  # of the body at the start [m/s]; learning may refine it
     boundaries: tuple[AbstractBoundary, ...] = ()
     damping: float = 0.0  # rate at which all velocities decay [1/s]
     cfl: float = 0.5  # cells a wave crosses in one automatic substep
@@ -68,10 +69,10 @@ class World:
         return PRECISIONS[self.precision]
 
     def estimate(self) -> Estimate:
-        """The initial guess: the start values, at rest. Raises ValueError as `check` does."""
+        """The initial guess: the start values and velocity. Raises ValueError as `check` does."""
         self.check()
         parameters = {name: torch.tensor(float(value), dtype=torch.float64) for name, value in self.start.items()}
-        return Estimate(parameters=parameters, velocity=torch.zeros(3))
+        return Estimate(parameters=parameters, velocity=torch.tensor(self.velocity, dtype=torch.float32))
 
 
 def _require(condition: bool, name: str, value: object, remedy: str) -> None:
