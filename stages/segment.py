@@ -14,7 +14,16 @@ from physics3d.segmentation import Segmentation
 from physics3d.segmentation.lift import contributions, islands, lift, touching
 from physics3d.segmentation.masks import AbstractMasker, GrabCut
 from physics3d.segmentation.previews import contact_sheet, tinted
-from physics3d.segmentation.prompts import Ball, Prompt, View, carry_masks, mask_of_box, prompted_mask, refined_mask
+from physics3d.segmentation.prompts import (
+    Prompt,
+    Room,
+    View,
+    carry_masks,
+    mask_of_box,
+    prompted_mask,
+    refined_mask,
+    within_any,
+)
 
 LEAST_PIXELS = 20  # a mask smaller than this is no mask
 
@@ -37,13 +46,13 @@ class Segment:
         gaussians = gaussians.to(self.device)
 
         if capture.images:
-            said, balls = self._prompted(capture, gaussians, parts)
-            every = self._views(capture, gaussians, said, balls, log)
-            views, maps = self._maps(capture, every, parts, said, balls, log)
-            label = self._lift(gaussians, views, maps, parts, balls)
+            said, rooms = self._prompted(capture, gaussians, parts)
+            every = self._views(capture, gaussians, said, rooms, log)
+            views, maps = self._maps(capture, every, parts, said, rooms, log)
+            label = self._lift(gaussians, views, maps, parts, rooms)
             if self.prompts:
-                views, maps = every, self._refine(gaussians, label, every, parts, said, balls, capture, log)
-                label = self._lift(gaussians, views, maps, parts, balls)
+                views, maps = every, self._refine(gaussians, label, every, parts, said, rooms, capture, log)
+                label = self._lift(gaussians, views, maps, parts, rooms)
             log.image("masks", contact_sheet([tinted(v.image, m.numpy()) for v, m in zip(views, maps)]))
             gaussians = gaussians.to("cpu")
         else:
@@ -81,14 +90,14 @@ class Segment:
 
     def _prompted(
         self, capture: Capture, gaussians: Gaussians, parts: tuple[str, ...]
-    ) -> tuple[dict[str, tuple[View, np.ndarray]], dict[str, Ball]]:
+    ) -> tuple[dict[str, tuple[View, np.ndarray]], dict[str, Room]]:
         """For each part that is prompted in an image: that view with its mask, and the space that the part may take."""
         if not self.prompts and not capture.alphas:
             raise ValueError(
                 f"segment.prompts is empty and {capture.name} has no mattes; say what moves, e.g. "
                 "prompts=[{view: 0, box: [0.3, 0.2, 0.7, 0.8]}] in fractions of width and height"
             )
-        said, balls = {}, {}
+        said, rooms = {}, {}
         in_image = [(p, _index(capture, p.view)) for p in self.prompts if p.in_image]
         for part in parts:
             where = {index for p, index in in_image if p.part == part}
@@ -100,19 +109,19 @@ class Segment:
             here = [p for p, index in in_image if index == view.index]
             own, others = (tuple(p for p in here if (p.part == part) == same) for same in (True, False))
             mask = prompted_mask(own, others, view, self.masker)
-            balls[part] = Ball.around(view, mask)
+            rooms[part] = Room.around(view, mask, tuple(p for p in self.prompts if p.part == part))
             said[part] = view, mask
-        return said, balls
+        return said, rooms
 
     def _maps(
-        self, capture: Capture, views: list[View], parts: tuple[str, ...], said, balls: dict[str, Ball], log: Log
+        self, capture: Capture, views: list[View], parts: tuple[str, ...], said, rooms: dict[str, Room], log: Log
     ) -> tuple[list[View], list[torch.Tensor]]:
         """The views that could be masked, and for each a map of labels [h, w]."""
         masks: dict[str, dict[int, np.ndarray]] = {}
         for part in parts:
             own = tuple(p for p in self.prompts if p.part == part)
             if part in said:
-                masks[part] = carry_masks(*said[part], balls[part], views, self.masker, log=log)
+                masks[part] = carry_masks(*said[part], rooms[part], views, self.masker, log=log)
             elif own:
                 found = {v.index: mask_of_box(own[0], v, self.masker) for v in log.progress(views, "masking the box")}
                 masks[part] = {i: m for i, m in found.items() if m is not None}
@@ -133,22 +142,18 @@ class Segment:
         log.info(f"{len(kept)} of {len(capture.images)} photographs masked")
         return kept, maps
 
-    def _lift(self, gaussians, views: list[View], maps: list[torch.Tensor], parts: tuple[str, ...], balls):
-        """Label int32 [n]; nothing outside a part's box in space or its ball belongs to it."""
+    def _lift(self, gaussians, views: list[View], maps: list[torch.Tensor], parts: tuple[str, ...], rooms):
+        """Label int32 [n]; nothing outside a part's box in space or its room belongs to it."""
         weights = contributions(gaussians, [v.camera for v in views], maps, 1 + len(parts))
         mean = gaussians.mean.cpu()
         label = lift(mean, weights)
         for k, part in enumerate(parts, 1):
-            boxes = [p for p in self.prompts if p.part == part and p.lower is not None]
-            if boxes:
-                allowed = torch.stack([p.within(mean) for p in boxes]).any(0)
-                label[(label == k) & ~allowed] = 0
-            if part in balls:
-                label[(label == k) & ~balls[part].holds(mean)] = 0
+            allowed = rooms[part].holds(mean) if part in rooms else within_any(self._boxes(part), mean)
+            label[(label == k) & ~allowed] = 0
         return label
 
     def _refine(
-        self, gaussians, label, views: list[View], parts: tuple[str, ...], said, balls, capture: Capture, log: Log
+        self, gaussians, label, views: list[View], parts: tuple[str, ...], said, rooms, capture: Capture, log: Log
     ) -> list[torch.Tensor]:
         """Maps again, each view now prompted by what all views together say; what a person prompted stays."""
         maps = []
@@ -169,17 +174,17 @@ class Segment:
                         background=(0, 0, 0),
                     )
                 mask = refined_mask(drawn.color[..., 0].cpu().numpy(), view, self.masker)
-                masks.append(mask & ~balls[part].excludes(view) if part in balls else mask)
+                masks.append(mask & ~rooms[part].excludes(view) if part in rooms else mask)
             maps.append(_labelled(masks, view, capture))
         return maps
 
-    def _views(self, capture: Capture, gaussians: Gaussians, said, balls: dict[str, Ball], log: Log) -> list[View]:
+    def _views(self, capture: Capture, gaussians: Gaussians, said, rooms: dict[str, Room], log: Log) -> list[View]:
         """The prompted views, and training photographs that show the parts whole, spread by farthest camera."""
         if self.views < 1:
             raise ValueError(f"segment.views is {self.views}, must be at least 1")
         first = list(dict.fromkeys(view.index for view, _ in said.values()))
         training = [i for i in range(len(capture.images)) if i not in capture.held_out or i in first]
-        whole = [i for i in training if i in first or all(b.whole_in(capture.cameras[i]) for b in balls.values())]
+        whole = [i for i in training if i in first or all(r.whole_in(capture.cameras[i]) for r in rooms.values())]
         candidates = whole if len(whole) >= min(self.views, 4) else training
         if len(candidates) < len(training):
             log.info(f"{len(candidates)} of {len(training)} photographs show the whole object")
@@ -207,16 +212,19 @@ class Segment:
         rendered = type(rendered)(color=rendered.color.cpu(), alpha=rendered.alpha.cpu(), depth=rendered.depth.cpu())
         return View(index, capture.names[index], image, camera, rendered)
 
+    def _boxes(self, part: str) -> tuple[Prompt, ...]:
+        return tuple(p for p in self.prompts if p.part == part and p.lower is not None)
+
     def _boxes_only(self, gaussians: Gaussians, parts: tuple[str, ...]) -> torch.Tensor:
         """Without photographs a part is what lies in its box in space."""
         label = torch.zeros(len(gaussians), dtype=torch.int32)
         for k, part in reversed(list(enumerate(parts, 1))):
-            boxes = [p for p in self.prompts if p.part == part and p.lower is not None]
+            boxes = self._boxes(part)
             if not boxes:
                 raise ValueError(
                     f"the capture has no photographs, so {part!r} needs a box in space: give lower and upper [m]"
                 )
-            label[torch.stack([p.within(gaussians.mean) for p in boxes]).any(0)] = k
+            label[within_any(boxes, gaussians.mean)] = k
         return label
 
     def _show(self, capture: Capture, gaussians: Gaussians, label: torch.Tensor, log: Log) -> None:

@@ -71,7 +71,7 @@ class GrabCut(AbstractMasker):
         mask = np.zeros((height, width), np.uint8)
         mask[near] = is_object()
         closed = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
-        return connected_to(closed.astype(bool), positive)
+        return without_specks(connected_to(closed.astype(bool), positive))
 
 
 def connected_to(mask: Bool[np.ndarray, "h w"], positive: Float[np.ndarray, "p 2"]) -> Bool[np.ndarray, "h w"]:
@@ -91,6 +91,19 @@ def connected_to(mask: Bool[np.ndarray, "h w"], positive: Float[np.ndarray, "p 2
             keep = np.bincount(touched, minlength=count + 1) > 0
     keep[0] = False
     return keep[parts]
+
+
+def without_specks(mask: Bool[np.ndarray, "h w"], share: float = 0.02) -> Bool[np.ndarray, "h w"]:
+    """The mask with its small holes filled, up to that share of its area each: eyes, buttons, highlights."""
+    from scipy import ndimage
+
+    holes, count = ndimage.label(~mask)
+    if count == 0:
+        return mask
+    small = np.bincount(holes.reshape(-1)) <= share * mask.sum()
+    edge = np.concatenate([holes[0], holes[-1], holes[:, 0], holes[:, -1]])
+    small[edge], small[0] = False, False
+    return mask | small[holes]
 
 
 @dataclass(frozen=True, kw_only=True)

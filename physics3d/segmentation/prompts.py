@@ -3,8 +3,8 @@
 The masked pixels of the prompted view become points of the object, X = o + z(u, v) d(u, v) [m]; projected into the next
 view they give a box and, where the rendered depth there says that they are visible, positive points; the pixels
 around the object give negative ones in the same way. Views are taken in the order of their angle to the prompted
-one, and each adds the points that it shows, so that the far side is reached step by step. What lies beyond a ball
-around the object is never part of it: prompt a view that shows the object at its largest.
+one, and each adds the points that it shows, so that the far side is reached step by step. What is farther
+behind the prompted view's surface than the object is wide is never part of it: prompt a view that shows it large.
 """
 
 from dataclasses import dataclass
@@ -71,6 +71,13 @@ class Prompt:
         return ((point >= lower + inset) & (point <= upper - inset)).all(1)
 
 
+def within_any(boxes: tuple[Prompt, ...], point: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
+    """Which points lie in at least one of the boxes in space; all if there is no box."""
+    if not boxes:
+        return torch.ones(len(point), dtype=torch.bool)
+    return torch.stack([p.within(point) for p in boxes]).any(0)
+
+
 @dataclass(frozen=True)
 class View:
     """A photograph and what the reconstruction shows there, at the same size."""
@@ -101,51 +108,62 @@ class View:
 
 
 @dataclass(frozen=True)
-class Ball:
-    """Space that the object may take, judged from one view: hardly deeper than it is wide or high there."""
+class Room:
+    """Space that the object may take: a box along the axes of a view that shows it, as deep as it is wide and high."""
 
-    centre: Float[Tensor, " 3"]  # [m]
-    radius: float  # [m]
+    world_to_camera: Float[Tensor, "4 4"]
+    lower: Float[Tensor, " 3"]  # in the camera's axes [m]
+    upper: Float[Tensor, " 3"]
+    boxes: tuple[Prompt, ...]  # with corners in space: where there are any, it is also in one of them
 
     @classmethod
-    def around(cls, view: View, mask: Bool[np.ndarray, "h w"]) -> "Ball":
-        """From the masked surface; measured across the line of sight, without the outermost 2 %.
+    def around(cls, view: View, mask: Bool[np.ndarray, "h w"], prompts: tuple[Prompt, ...] = ()) -> "Room":
+        """From the masked surface, with a margin of an eighth.
 
         Raises ValueError if the reconstruction shows next to nothing there.
         """
-        visible = view.points(eroded(mask, 2))
+        boxes = tuple(p for p in prompts if p.lower is not None)
+        silhouette, visible = (p[within_any(boxes, p)] for p in (view.points(mask), view.points(eroded(mask, 2))))
         if len(visible) < 10:
             raise ValueError(
-                f"the mask in view {view.name} covers only {len(visible)} opaque pixels of the reconstruction; "
+                f"the mask in view {view.name} covers only {len(visible)} opaque pixels of the reconstruction"
+                f"{' in the box in space' if boxes else ''}; "
                 "choose a view in which the object is large, or reconstruct longer"
             )
         M = view.camera.world_to_camera.to(visible)
-        low, mid, high = np.quantile((visible @ M[:3, :3].T + M[:3, 3]).numpy(), (0.02, 0.5, 0.98), axis=0)
-        size = float(np.linalg.norm((high - low)[:2]))
-        # the middle across the line of sight, and a little behind the surface that is seen
-        local = [*(0.5 * (low + high)[:2]).tolist(), float(mid[2]) + 0.2 * size]
-        return cls((torch.tensor(local).to(visible) - M[:3, 3]) @ M[:3, :3], 0.65 * size)
+        local = lambda point: (point @ M[:3, :3].T + M[:3, 3]).numpy()
+        low, high = np.quantile(local(silhouette), (0.005, 0.995), axis=0)
+        size = (high - low)[:2].mean()
+        low[2] = np.quantile(local(visible)[:, 2], 0.02)  # outlines, whose depths mix, say nothing of this
+        high[2] = low[2] + size
+        low, high = (torch.from_numpy(v).to(visible) for v in (low - size / 8, high + size / 8))
+        return cls(M, low, high, boxes)
+
+    @property
+    def centre(self) -> Float[Tensor, " 3"]:
+        """[m], in the world."""
+        return (0.5 * (self.lower + self.upper) - self.world_to_camera[:3, 3]) @ self.world_to_camera[:3, :3]
 
     def whole_in(self, camera: Camera) -> bool:
-        """Does the camera see most of the ball? Its centre, and four fifths of the radius around it."""
-        uv, depth = self.centre_in(camera)
-        reach = 0.8 * self.radius * min(camera.fx, camera.fy) / max(depth, 1e-9)
-        return depth > self.radius and reach <= min(*uv, camera.width - uv[0], camera.height - uv[1])
-
-    def centre_in(self, camera: Camera) -> tuple[list[float], float]:
-        """Pixel and depth [m] of the centre."""
+        """Does the camera see most of it: the ball in it that touches the nearest pair of its sides?"""
         uv, depth = camera.project(self.centre[None])
-        return uv[0].tolist(), float(depth[0])
+        radius = 0.5 * float((self.upper - self.lower).min())
+        reach = radius * min(camera.fx, camera.fy) / float(depth.clamp_min(1e-9))
+        u, v = uv[0].tolist()
+        return float(depth) > radius and reach <= min(u, v, camera.width - u, camera.height - v)
 
     def holds(self, point: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
-        return (point - self.centre.to(point)).norm(dim=1) <= self.radius
+        M = self.world_to_camera.to(point)
+        local = point @ M[:3, :3].T + M[:3, 3]
+        inside = ((local >= self.lower.to(point)) & (local <= self.upper.to(point))).all(1)
+        return inside & within_any(self.boxes, point)
 
     def excludes(self, view: View) -> Bool[np.ndarray, "h w"]:
-        """Pixels whose surface is beyond the ball."""
-        beyond = np.zeros(view.image.shape[:2], bool)
-        point = view.points(~beyond)
-        beyond[(view.rendered.alpha > 0.5).numpy()] = (~self.holds(point)).numpy()
-        return beyond
+        """Pixels whose surface is outside."""
+        outside = np.zeros(view.image.shape[:2], bool)
+        point = view.points(~outside)
+        outside[(view.rendered.alpha > 0.5).numpy()] = (~self.holds(point)).numpy()
+        return outside
 
 
 def prompted_mask(prompts: tuple[Prompt, ...], others: tuple[Prompt, ...], view: View, masker: AbstractMasker):
@@ -173,14 +191,14 @@ def prompted_mask(prompts: tuple[Prompt, ...], others: tuple[Prompt, ...], view:
 
 
 def carry_masks(
-    first: View, mask: Bool[np.ndarray, "h w"], ball: Ball, views: list[View], masker: AbstractMasker, *, log: Log
+    first: View, mask: Bool[np.ndarray, "h w"], room: Room, views: list[View], masker: AbstractMasker, *, log: Log
 ) -> dict[int, Bool[np.ndarray, "h w"]]:
     """Masks by view index: the first one, and those of the other views that agree with the points carried to them."""
-    mask = mask & ~ball.excludes(first)
+    mask = mask & ~room.excludes(first)
     masks = {first.index: mask}
     inside, outside = first.points(eroded(mask, 2)), first.points(eroded(~mask, 2))
     inside, outside = thinned(inside, MOST_CARRIED), thinned(outside, MOST_CARRIED)
-    towards = lambda view: torch.nn.functional.normalize(view.camera.centre.to(ball.centre) - ball.centre, dim=0)
+    towards = lambda view: torch.nn.functional.normalize(view.camera.centre.to(room.centre) - room.centre, dim=0)
     order = sorted((v for v in views if v.index != first.index), key=lambda v: -float(towards(v) @ towards(first)))
     for view in log.progress(order, "carrying the prompt"):
         uv, seen = view.sees(inside)
@@ -191,7 +209,7 @@ def carry_masks(
         box = bounds(uv[seen], 0.3, view)
         around, clear = view.sees(outside)
         clear &= ((around >= box[:2]) & (around <= box[2:])).all(1)
-        beyond = ball.excludes(view)
+        beyond = room.excludes(view)
         pixels = np.argwhere(beyond)[:, ::-1] + 0.5
         pixels = pixels[((pixels >= box[:2]) & (pixels <= box[2:])).all(1)]
         found = masker(

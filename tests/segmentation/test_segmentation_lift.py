@@ -10,7 +10,7 @@ from physics3d.gaussians.render import render
 from physics3d.log import Log
 from physics3d.segmentation.lift import contributions, islands, lift, touching
 from physics3d.segmentation.masks import GrabCut
-from physics3d.segmentation.prompts import Ball, Prompt, View, carry_masks
+from physics3d.segmentation.prompts import Prompt, Room, View, carry_masks
 
 CAMERAS = cameras_around(10, 0.4)
 
@@ -99,7 +99,7 @@ def test_a_mask_reaches_the_far_side(scene):
     a, b, first, *rest = views(gaussians)  # the third shows the red ball whole
     others = [a, b, *rest]
     mask = (true_map(gaussians, truth, first.camera) == 1).numpy()
-    masks = carry_masks(first, mask, Ball.around(first, mask), [first, *others], GrabCut(), log=Log(None))
+    masks = carry_masks(first, mask, Room.around(first, mask), [first, *others], GrabCut(), log=Log(None))
     assert len(masks) >= 9
     for view in others:
         true = (true_map(gaussians, truth, view.camera) == 1).numpy()
