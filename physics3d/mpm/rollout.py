@@ -244,7 +244,7 @@ class _Solver:
         for done in range(0, count, RUN):
             steps = min(RUN, count - done)
             now = self.substeps.state(self.current)
-            lowest, size = self._window(now, steps * dt, reach, frame)
+            lowest, size = self._window(now, steps, dt, reach, frame)
             self.substeps.set_window(lowest, size)
             clock = self._clock((frame - 1) * self.frame_dt + done * dt, dt, steps)
             runs.append(_Run(lowest, size, clock, now.flat.clone() if keep else None))
@@ -275,11 +275,13 @@ class _Solver:
                 "enlarge world.lower and world.upper, or add a BoundingBox or a HalfSpace"
             )
 
-    def _window(self, now, duration: float, reach: float, frame: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        """Nodes around the particles, with room for `reach` times the way they can go in `duration` [s]."""
+    def _window(self, now, steps: int, dt: float, reach: float, frame: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """Nodes around the particles, with room for `reach` times the way they can go in `steps` substeps of dt [s]."""
+        duration = steps * dt
         speed = float(now.v.norm(dim=1).max()) + math.hypot(*self.world.gravity) * duration
         cells = self.cell + (self.offset + now.u / self.world.dx).floor()
-        room = 2 + math.ceil(reach * (1 + speed * duration / self.world.dx))
+        # a legal substep moves no particle farther than a cell, so no more room than that, however fast they are
+        room = 2 + math.ceil(min(reach * (1 + speed * duration / self.world.dx), reach + steps))
         lowest = cells.amin(0) - room
         size = cells.amax(0) + room + 1 - lowest
         if not bool(torch.isfinite(size).all()) or float(size.double().prod()) > MOST_NODES:
