@@ -165,7 +165,7 @@ class Enclosure:
         """bool [m, 26]: does a ray from x in that direction meet a voxel of the surface?"""
         at, size = self.voxel(x), np.array(self.blocked.shape[1:])
         within = ((at >= 0) & (at < size)).all(1)
-        return self.blocked[:, *np.where(within[:, None], at, 0).T].T & within[:, None]
+        return self.blocked[:, *np.where(within[:, None], at, 0).T].T & within[:, None]  # type: ignore[arg-type, index]
 
     def share(self, x: np.ndarray) -> np.ndarray:
         """[m] in 0..1: share of the directions in which x is enclosed."""
@@ -189,7 +189,7 @@ def swept(occupied: np.ndarray, direction: np.ndarray) -> np.ndarray:
 
 def shifted(a: np.ndarray, by: np.ndarray) -> np.ndarray:
     """b[v] = a[v + by], False outside."""
-    by = [int(np.clip(d, -n, n)) for d, n in zip(by, a.shape)]
+    by = [int(np.clip(d, -n, n)) for d, n in zip(by, a.shape)]  # type: ignore[assignment]
     out = np.zeros_like(a)
     to = tuple(slice(max(0, -d), n - max(0, d)) for d, n in zip(by, a.shape))
     of = tuple(slice(max(0, d), n - max(0, -d)) for d, n in zip(by, a.shape))
@@ -261,7 +261,7 @@ def fill(
     log.info(
         f"solid: {len(position)} particles, {solid_volume:.4g} m^3, {int(inner.sum())} of them interior; "
         + (
-            f"thin: {len(thin_position)} particles, {thin_area.sum():.4g} m^2, {1e3 * thickness:.2g} mm thick"
+            f"thin: {len(thin_position)} particles, {thin_area.sum():.4g} m^2, {1e3 * thickness:.2g} mm thick"  # type: ignore[operator]
             if len(thin_position)
             else "no thin part"
         )
@@ -279,7 +279,7 @@ def fill(
 
     _, nearest = cKDTree(shown.mean.double().numpy()).query(position)
     part = (label[which][reliable][torch.from_numpy(nearest)] - 1).to(torch.int32)
-    position = torch.from_numpy(position).to(torch.float32)
+    position = torch.from_numpy(position).to(torch.float32)  # type: ignore[assignment]
     return Body(
         position=position,
         volume=torch.from_numpy(volume).to(torch.float32),
@@ -302,7 +302,7 @@ def spread(gaussians: Gaussians, step: float) -> tuple[np.ndarray, np.ndarray]:
     """Points [k, 3] [m] at most `step` apart over one deviation of every disc, and the Gaussian [k] that each is of."""
     scale, order = torch.exp(gaussians.log_scale.double()).sort(dim=1)
     axes = torch.gather(gaussians.rotation().double(), 2, order[:, None, :].expand(-1, 3, -1)).numpy()
-    scale, mean = scale.numpy(), gaussians.mean.double().numpy()
+    scale, mean = scale.numpy(), gaussians.mean.double().numpy()  # type: ignore[assignment]
     points, owners = [], []
     counts = np.clip(2 * np.ceil(scale[:, 1:] / step - 0.5).astype(int) + 1, 1, 25)  # odd, so that the centre is one
     for a, b in np.unique(counts, axis=0):

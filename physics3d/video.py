@@ -59,7 +59,7 @@ def write_mp4(path: Path, frames: UInt8[Tensor, "t h w 3"], fps: float) -> None:
         path, fps=fps, codec="libx264", quality=8, macro_block_size=2, ffmpeg_log_level="error"
     ) as out:
         for frame in array[:, :h, :w]:
-            out.append_data(frame)
+            out.append_data(frame)  # type: ignore[attr-defined]
 
 
 def read_mp4(path: Path) -> tuple[UInt8[Tensor, "t h w 3"], float]:
@@ -71,8 +71,8 @@ def read_mp4(path: Path) -> tuple[UInt8[Tensor, "t h w 3"], float]:
         raise ValueError(f"no video at {path}; check the path in the scene's configuration")
     try:
         with imageio.get_reader(path) as reader:
-            fps = float(reader.get_meta_data()["fps"])
-            frames = np.stack([np.asarray(frame) for frame in reader])
+            fps = float(reader.get_meta_data()["fps"])  # type: ignore[attr-defined]
+            frames = np.stack([np.asarray(frame) for frame in reader])  # type: ignore[attr-defined]
     except Exception as error:
         raise ValueError(f"cannot read the video {path}: {error}") from error
     return torch.from_numpy(frames), fps

@@ -101,8 +101,8 @@ class Evaluate:
                         cells["flow_error"] = flow_error(u, u_ref, mask), ""
                     found, why = oscillation(signal(u, u_ref, mask), fps)
                     cells["frequency"], cells["damping"] = (
-                        (found and found.frequency, ""),
-                        (found and found.damping, ""),
+                        (found and found.frequency, ""),  # type: ignore[assignment]
+                        (found and found.damping, ""),  # type: ignore[assignment]
                     )
                     if why:
                         notes.setdefault(f"oscillation of {row}", why)
@@ -110,7 +110,7 @@ class Evaluate:
             table[row] = {}
             for name in per_camera[0]:
                 known = [cells[name][0] for cells in per_camera if cells[name][0] is not None]
-                table[row][name] = float(np.mean(known)) if known else None
+                table[row][name] = float(np.mean(known)) if known else None  # type: ignore[arg-type]
                 for reason in {cells[name][1] for cells in per_camera} - {""}:
                     notes.setdefault(name, reason)
         return table

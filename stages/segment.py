@@ -121,7 +121,7 @@ class Segment:
         for part in parts:
             own = tuple(p for p in self.prompts if p.part == part)
             if part in said:
-                masks[part] = carry_masks(*said[part], rooms[part], views, self.masker, log=log)
+                masks[part] = carry_masks(*said[part], rooms[part], views, self.masker, log=log)  # type: ignore[arg-type, call-arg, misc]
             elif own:
                 found = {v.index: mask_of_box(own[0], v, self.masker) for v in log.progress(views, "masking the box")}
                 masks[part] = {i: m for i, m in found.items() if m is not None}

@@ -183,7 +183,7 @@ def fit(
     centres = torch.stack([p.camera.centre for p in photographs])
     extent = float((centres - centres.mean(0)).norm(dim=-1).max()) * 1.1
     coarse = [p.scaled(0.5) for p in photographs]
-    model, moments, first = start.to(device, torch.float32), {}, len(start)
+    model, moments, first = start.to(device, torch.float32), {}, len(start)  # type: ignore[var-annotated]
     queue: list[int] = []
     best, stale, recent = -math.inf, 0, float("nan")
 

@@ -43,9 +43,9 @@ class Chain:
         for view in views:
             clip = self.clips[view]
             condition = self.prior.condition(clip[0], (clip[frames],))
-            total = total + sds_loss(self.prior, self.render(motion, view, frames), condition, generator=generator)
+            total = total + sds_loss(self.prior, self.render(motion, view, frames), condition, generator=generator)  # type: ignore[assignment]
             pixels += clip[frames].numel()
-        return total / pixels
+        return total / pixels  # type: ignore[return-value]
 
     def measure(self, theta: Tensor, seed: int) -> float:
         """The first term of L over all views and frames, always with the same noise."""
@@ -102,9 +102,9 @@ def fit(
         adam.zero_grad()
         data = chain.loss(theta, views, frames, generator) / unit
         (data + 0.5 * stay * theta.square().sum()).backward()
-        if not torch.isfinite(theta.grad).all():
+        if not torch.isfinite(theta.grad).all():  # type: ignore[arg-type]
             retreats += 1
-            log.warn(f"step {step}: gradient {theta.grad.tolist()} is not finite; going half the way back")
+            log.warn(f"step {step}: gradient {theta.grad.tolist()} is not finite; going half the way back")  # type: ignore[union-attr]
             if retreats > MOST_RETREATS:
                 raise ValueError(
                     f"learning: the gradient was not finite {retreats} times in a row (step {step}); lower "

@@ -50,7 +50,7 @@ def flow(video: UInt8[Tensor, "t h w 3"]) -> Float[np.ndarray, "t h w 2"]:
     import cv2
 
     grey = [cv2.cvtColor(np.ascontiguousarray(frame), cv2.COLOR_RGB2GRAY) for frame in video.numpy()]
-    method = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    method = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)  # type: ignore[attr-defined]
     fields, last = [np.zeros((*grey[0].shape, 2), np.float32)], None
     for frame in grey[1:]:
         last = method.calc(grey[0], frame, None if last is None else last.copy())  # starting from the last one

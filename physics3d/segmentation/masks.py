@@ -67,7 +67,7 @@ class GrabCut(AbstractMasker):
         if is_object().any() and not is_object().all():
             cv2.setRNGSeed(0)
             models, pixels = (np.zeros((1, 65)), np.zeros((1, 65))), np.ascontiguousarray(image[near][..., ::-1])
-            cv2.grabCut(pixels, guess, None, *models, self.iterations, cv2.GC_INIT_WITH_MASK)
+            cv2.grabCut(pixels, guess, None, *models, self.iterations, cv2.GC_INIT_WITH_MASK)  # type: ignore[call-overload]
         mask = np.zeros((height, width), np.uint8)
         mask[near] = is_object()
         closed = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))

@@ -44,8 +44,8 @@ class Prompt:
         name = f"prompt for {self.part!r} in view {self.view!r}"
         if (self.lower is None) != (self.upper is None):
             raise ValueError(f"{name}: give both lower and upper corner of the box in space, or neither")
-        if self.lower is not None and not all(a < b for a, b in zip(self.lower, self.upper)):
-            raise ValueError(f"{name}: lower {tuple(self.lower)} must be below upper {tuple(self.upper)} in every axis")
+        if self.lower is not None and not all(a < b for a, b in zip(self.lower, self.upper)):  # type: ignore[arg-type]
+            raise ValueError(f"{name}: lower {tuple(self.lower)} must be below upper {tuple(self.upper)} in every axis")  # type: ignore[arg-type]
         if not self.in_image and self.lower is None:
             raise ValueError(f"{name}: give positive points, a box, or lower and upper corners in space")
         for what, points in (("positive", self.positive), ("negative", self.negative)):
