@@ -8,8 +8,8 @@ Both bars are one cell thick, lie between lateral slip walls and are clamped at 
     viscoelastic bar   u = a(t) sin(q X),  rho a'' = -q^2 (M_E a + K_N z_v + 4/3 mu_N z_d),  z' = a' - k z
 
 and the shear start-up is the Maxwell branch alone at one material point, without a grid. The error is the relative L2
-error over particles and 41 frames of 2 s (of the final tau_12 and N1 for the start-up); the time is the median of three runs
-after a warm-up, wall clock, one thread. A run is refused when its fixed substep is above the stable limit.
+error over particles and 41 frames of 2 s (of the final tau_12 and N1 for the start-up); the time is the median of three
+runs after a warm-up, wall clock, one thread. A run is refused when its fixed substep is above the stable limit.
 """
 
 import csv

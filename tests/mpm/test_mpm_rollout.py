@@ -281,7 +281,7 @@ def test_two_elastic_blocks_bounce_without_creating_energy():
 
 
 def test_room_of_the_grid_does_not_grow_with_the_speed(monkeypatch):
-    """Under 1e6 m/s^2 the first, far too long substeps must be rejected on a small grid, not tried on an endless one."""
+    """Under 1e6 m/s^2 the first, far too long substeps are rejected on a small grid, not tried on a huge one."""
     monkeypatch.setattr("physics3d.mpm.rollout.MOST_NODES", 100**3)
     position, volume = block((2, 2, 2), 0.1)
     world = soft_world(gravity=(0.0, 0.0, -1e6))
