@@ -22,7 +22,7 @@ PICTURES = {
     "learn": ("parameters.png", "reference_above_learned.png"),
     "simulate": ("motion.png",),
     "render": ("*_frames.png", "*_space_time.png"),
-    "evaluate": ("frames.png", "bars.png"),
+    "evaluate": ("frames*.png", "bars.png"),
 }
 
 
@@ -69,3 +69,7 @@ def keep(picture: Path, target: Path) -> None:
     with Image.open(picture) as image:
         image.thumbnail((1280, 1280))
         image.convert("RGB").save(target, quality=82)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
