@@ -5,6 +5,7 @@
 Nothing is computed here; run the scene first (`make run SCENE=carnation`).
 """
 
+import sys
 from pathlib import Path
 
 from machine import machine
