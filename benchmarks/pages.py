@@ -37,7 +37,9 @@ def main(words: list[str]) -> None:
     name = picked["scene"] if picked["method"] == "physics3d" else f"{picked['scene']}_{picked['method']}"
     steps = {step.name: step for step in plan.steps}
     told = {name: manifest(step) for name, step in steps.items()}
-    lines = [f"# {name}, profile {picked['profile']}", "", f'Made by `make bench-pages ARGS="{" ".join(words)}"`.', ""]
+    said = [word for word in words if not word.startswith(("data=", "output=", "device="))]  # those of one machine
+    made = f'make bench-pages ARGS="{" ".join(said)}"'
+    lines = [f"# {name}, profile {picked['profile']}", "", f"Made by `{made}` after `make run`.", ""]
     lines += [f"Machine: {machine(config['device'])}; seed {config['seed']}.", ""]
     lines += ["| stage | seconds | peak memory of the process |", "|---|---|---|"]
     lines += [f"| {n} | {t['seconds']:.1f} | {t['peak_rss_bytes'] / 1e9:.1f} GB |" for n, t in told.items()]
