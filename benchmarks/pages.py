@@ -26,6 +26,15 @@ PICTURES = {
     "evaluate": ("frames*.png", "bars.png"),
 }
 
+# these show the recording itself: of data that others own they stay at home
+PHOTOGRAPHS = {
+    *(("capture", p) for p in PICTURES["capture"]),
+    *(("reconstruct", p) for p in PICTURES["reconstruct"]),
+    ("segment", "masks.png"),
+    ("learn", "reference_above_learned.png"),
+    ("evaluate", "frames*.png"),
+}
+
 
 def main(words: list[str]) -> None:
     config, picked = compose(words or ["scene=carnation"])
@@ -48,11 +57,14 @@ def main(words: list[str]) -> None:
     scores = steps["evaluate"].folder / "scores.md" if "evaluate" in steps else None
     if scores is not None:
         lines += [scores.read_text(), ""]
+    real = "path" in config["scene"]["source"]
     for stage, patterns in PICTURES.items():
         if stage not in steps:
             continue
         previews = steps[stage].folder / "previews"
         for pattern in patterns:
+            if real and (stage, pattern) in PHOTOGRAPHS:
+                continue
             picture = max(previews.glob(pattern), default=None)  # the last step of a series
             if picture is None:
                 continue
