@@ -10,12 +10,15 @@ explicit step needs dt < rho dx^2 / (6 eta) besides the sound-speed limit. Bird,
 import functools
 from dataclasses import dataclass
 
+import torch
 import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
 from physics3d.mpm import spectral
 from physics3d.mpm.materials import base
+
+_LEAST_RATE = 1e-3  # g_0 [1/s]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +50,12 @@ class Newtonian(base.AbstractMaterial):
     def wave_modulus(self, coefficients: Float[Tensor, "3 n"]) -> Float[Tensor, " n"]:
         return coefficients[0]
 
+    def viscosity(self, coefficients: Float[Tensor, "3 n"], L: Float[Tensor, "n 3 3"]) -> Float[Tensor, " n"]:
+        D = (L + L.mT) / 2
+        dev = D - D.diagonal(dim1=1, dim2=2).mean(1)[:, None, None] * torch.eye(3, dtype=L.dtype, device=L.device)
+        _, k, n = coefficients
+        return k * (2 * (dev * dev).sum((1, 2)) + _LEAST_RATE**2) ** ((n - 1) / 2)
+
     def energy(
         self, coefficients: Float[Tensor, "3 n"], H: Float[Tensor, "n 3 3"], memory: Float[Tensor, "1 n"]
     ) -> Float[Tensor, " n"]:
@@ -60,6 +69,7 @@ class Newtonian(base.AbstractMaterial):
 def _advance(real: type) -> wp.Function:
     mat33 = spectral.matrix_type(real)
     volume_change = spectral.volume_change(real)
+    least2 = real(_LEAST_RATE**2)
 
     @wp.func(name=f"newtonian_{real.__name__}")
     def advance(
@@ -77,7 +87,7 @@ def _advance(real: type) -> wp.Function:
         memory_next[0, p] = j
         J = real(1.0) + j
         D = real(0.5) * (L + wp.transpose(L)) - wp.trace(L) / real(3.0) * one
-        g2 = real(2.0) * wp.ddot(D, D) + real(1e-6)
+        g2 = real(2.0) * wp.ddot(D, D) + least2
         eta = coefficients[1, p] * wp.pow(g2, real(0.5) * (coefficients[2, p] - real(1.0)))
         return H + M + M * H, coefficients[0, p] * J * j * one + real(2.0) * eta * wp.max(J, real(0.0)) * D
 
