@@ -191,11 +191,42 @@ def _corotated(real: type) -> wp.Function:
 
 
 @functools.cache
+def maxwell_branches(branches: int, spring: str, real: type) -> wp.Function:
+    """all(p, dt, M, first, row, coefficients, memory, memory_next) -> stress of the branches, carried by I + M and
+    relaxed over dt; their coefficients begin at row `first`, their memory at `row`."""
+    mat33 = spectral.matrix_type(real)
+    maxwell = _MAXWELL[spring](real)
+    carried, store = base.carried_strain(real), base.store_strain(real)
+
+    @wp.func(name=f"maxwell_branches_{branches}_{spring}_{real.__name__}")
+    def all_branches(
+        p: int,
+        dt: real,  # [s]
+        M: mat33,
+        first: int,
+        row: int,
+        coefficients: wp.array2d(dtype=real),  # from `first`: mu_N, K_N [Pa], k_d, k_v [1/s] of each branch
+        memory: wp.array2d(dtype=real),  # from `row`: upper triangle of b_N - I of each branch
+        memory_next: wp.array2d(dtype=real),
+    ):
+        tau = mat33()
+        for i in range(wp.static(branches)):
+            k = first + 4 * i
+            d, v = dt * coefficients[k + 2, p], dt * coefficients[k + 3, p]
+            X_trial = carried(p, row + 6 * i, M, memory)
+            tau_N, X = maxwell(X_trial, coefficients[k, p], coefficients[k + 1, p], d, v)
+            store(p, row + 6 * i, X, memory_next)
+            tau = tau + tau_N
+        return tau
+
+    return spectral.without_replay(all_branches)
+
+
+@functools.cache
 def _advance(branches: int, elastic: bool, spring: str, real: type) -> wp.Function:
     mat33 = spectral.matrix_type(real)
     corotated = _corotated(real)
-    maxwell = _MAXWELL[spring](real)
-    carried, store = base.carried_strain(real), base.store_strain(real)
+    all_branches = maxwell_branches(branches, spring, real)
     key = f"{branches}_{'elastic' if elastic else 'viscous'}_{spring}_{real.__name__}"
     first = 2 if elastic else 0
 
@@ -214,12 +245,8 @@ def _advance(branches: int, elastic: bool, spring: str, real: type) -> wp.Functi
         tau = mat33()
         if wp.static(elastic):
             tau = tau + corotated(H_next, coefficients[0, p], coefficients[1, p])
-        for i in range(wp.static(branches)):
-            k = first + 4 * i
-            d, v = dt * coefficients[k + 2, p], dt * coefficients[k + 3, p]
-            tau_N, X = maxwell(carried(p, 6 * i, M, memory), coefficients[k, p], coefficients[k + 1, p], d, v)
-            store(p, 6 * i, X, memory_next)
-            tau = tau + tau_N
+        if wp.static(branches):
+            tau = tau + all_branches(p, dt, M, first, 0, coefficients, memory, memory_next)
         return H_next, tau
 
     return spectral.without_replay(advance)
