@@ -13,6 +13,7 @@ from physics3d.mpm.boundaries.enforced_rotation import EnforcedRotation
 from physics3d.mpm.boundaries.enforced_translation import EnforcedTranslation
 from physics3d.mpm.boundaries.fixed_region import FixedRegion
 from physics3d.mpm.boundaries.half_space import HalfSpace
+from physics3d.mpm.boundaries.held_particles import HeldParticles
 from physics3d.mpm.boundaries.impulse import Impulse
 from physics3d.mpm.boundaries.moving_cuboid import MovingCuboid
 from physics3d.mpm.boundaries.sequential_release import SequentialRelease
@@ -71,6 +72,7 @@ EXAMPLES: list[AbstractBoundary] = [
     HalfSpace(point=(0.0, 0.0, 0.05), normal=(0.1, 0.0, 1.0), kind="slip"),
     HalfSpace(point=(0.0, 0.0, 0.05), normal=(0.1, 0.0, 1.0), kind="sticky"),
     FixedRegion(lower=(-0.1, -0.1, -0.1), upper=(0.1, 0.4, 0.4)),
+    HeldParticles(position=((0.05, 0.05, 0.02), (0.05, 0.22, 0.02), (0.22, 0.1, 0.04))),
     Impulse(force=(30.0, 5.0, -4.0), centre=(0.2, 0.2, 0.2), radius=0.12, start=0.013, duration=0.03),
     MovingCuboid(lower=(-0.1, -0.1, -0.1), upper=(0.1, 0.4, 0.1), velocity=(0.5, 0.0, 0.5), start=0.01, duration=0.05),
     EnforcedTranslation(lower=(0.0, 0.0, 0.0), upper=(0.1, 0.3, 0.3), velocity=(-0.3, 0.2, 0.0), duration=0.05),
