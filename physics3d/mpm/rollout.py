@@ -335,6 +335,10 @@ class _Solver:
         mass, v = self.mass.double(), now.v.double()
         x = self.rest.double() + now.u.double()
         momentum = (mass[:, None] * v).sum(0)
+        # about the origin, with the spin inside the particles: an APIC particle is a cloud of m dx^2/4 along each axis
+        L = now.L.double()
+        spin = torch.stack([L[:, 2, 1] - L[:, 1, 2], L[:, 0, 2] - L[:, 2, 0], L[:, 1, 0] - L[:, 0, 1]], 1)
+        angular = (mass[:, None] * (torch.linalg.cross(x, v) + self.world.dx**2 / 4 * spin)).sum(0)
         kinetic = 0.5 * float((mass * v.square().sum(1)).sum())
         psi = self.world.material.energy(self.coefficients, now.H, now.memory).double()
         elastic = float((psi * self.volume.double()).sum())
@@ -356,6 +360,9 @@ class _Solver:
             "momentum_x": float(momentum[0]),
             "momentum_y": float(momentum[1]),
             "momentum_z": float(momentum[2]),
+            "angular_momentum_x": float(angular[0]),
+            "angular_momentum_y": float(angular[1]),
+            "angular_momentum_z": float(angular[2]),
             "substeps": float(self.counts[-1] if self.counts else 0),
         }
 
