@@ -25,7 +25,7 @@ from torch import Tensor
 
 from physics3d.artifact import AbstractArtifact, require_finite
 from physics3d.log import Log
-from physics3d.mpm.boundaries.base import AbstractBoundary, Setting, Vector
+from physics3d.mpm.boundaries.base import AbstractBoundary, Setting, Vector, mirror_nodes
 from physics3d.mpm.substep import Hook, Substeps, start_warp
 from physics3d.mpm.transfer import velocity_gradient
 from physics3d.mpm.world import World
@@ -302,7 +302,8 @@ class _Solver:
     def _speeds(self, now) -> tuple[float, float]:
         """(fastest wave, fastest particle) [m/s]."""
         low, high = _extreme_eigenvalues(now.tau.double())
-        c = ((self.modulus.double() + 2 * torch.maximum(high, -low)) / self.world.density).sqrt().max()
+        modulus = self.modulus * self.world.material.stiffening(self.coefficients, now.memory)
+        c = ((modulus.double() + 2 * torch.maximum(high, -low)) / self.world.density).sqrt().max()
         return float(c), float(now.v.double().norm(dim=1).max())
 
     def _limit(self, now) -> float:
@@ -406,6 +407,7 @@ class _Solver:
             pushes=tuple[Hook, ...](pushes),
             nodes=tuple[Hook, ...](nodes),
             steers=tuple[Hook, ...](steers),
+            walls=mirror_nodes(self.boundaries, self.setting),
             material=world.material.advance(real),
             memory_rows=world.material.memory_rows,
             longest_run=RUN,

@@ -176,8 +176,11 @@ def test_adjoint_is_the_derivative(material, rng):
         def shifted(t, i=i, direction=direction):
             return functional([x + t * direction if j == i else x for j, x in enumerate(inputs)])
 
-        h = 1e-4
-        slope = (8 * (shifted(h) - shifted(-h)) - (shifted(2 * h) - shifted(-2 * h))) / (12 * h)
+        wide, narrow = (
+            (8 * (shifted(h) - shifted(-h)) - (shifted(2 * h) - shifted(-2 * h))) / (12 * h) for h in (1e-4, 1e-6)
+        )
+        # where they disagree, yielding begins or ends within the wider one
+        slope = torch.where((wide - narrow).abs() < 1e-5 * (1 + narrow.abs()), wide, narrow)
         # fourth-order differences: h^4 times fifth derivatives, and round-off 1e-16/h; functionals are of order one
         torch.testing.assert_close(exact, slope, rtol=1e-6, atol=1e-8)
 

@@ -51,6 +51,10 @@ class AbstractMaterial(abc.ABC):
     def wave_modulus(self, coefficients: Float[Tensor, "k n"]) -> Float[Tensor, " n"]:
         """lam + 2 mu at rest, all branches stiff [Pa]: rho c^2 of the fastest wave."""
 
+    def stiffening(self, coefficients: Float[Tensor, "k n"], memory: Float[Tensor, "m n"]) -> Float[Tensor, " n"]:
+        """What `wave_modulus` has to be multiplied by in the present state, where flow hardens the springs."""
+        return torch.ones_like(coefficients[0])
+
     def viscosity(self, coefficients: Float[Tensor, "k n"], L: Float[Tensor, "n 3 3"]) -> Float[Tensor, " n"]:
         """Shear viscosity [Pa s] acting on the velocity gradient L [1/s] without a spring in series: an explicit step
         needs dt < rho dx^2 / (6 eta). None by default: a dash-pot behind a spring sets no limit of its own."""

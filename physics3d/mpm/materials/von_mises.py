@@ -76,7 +76,7 @@ def _advance(real: type) -> wp.Function:
         if real(4.0) * mu * mu * size > limit * limit:
             norm = wp.sqrt(size)
             gained = (real(2.0) * mu * norm - limit) / (root * (real(3.0) * mu + h))
-            shrink = -wp.log(real(1.0) - gained / (root * norm))
+            shrink = -wp.log((limit + root * h * gained) / (real(2.0) * mu * norm))
         return gained, shrink
 
     @wp.func(name=f"von_mises_{real.__name__}")
