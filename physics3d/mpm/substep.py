@@ -66,8 +66,54 @@ def _push(real, hooks: tuple[Hook, ...]) -> wp.Kernel:
 
 
 @cache
-def _update(real, hooks: tuple[Hook, ...]) -> wp.Kernel:
+def _mirror(real) -> tuple[wp.Function, wp.Function]:
+    """Warp functions of walls that mirror: walls[0:3] lower, walls[3:6] upper nodes, then 1 where one is sticky.
+
+    flip(axis, sticky) is the sign of each velocity component in the image; folded(at, window, walls, grid) the momentum
+    and mass of a node in front of the walls with those of its images one node behind them (27 at an inner corner)."""
     vec3, vec4 = vector(real), vector4(real)
+
+    @wp.func
+    def flip(axis: int, sticky: int) -> vec3:
+        one = real(1.0)
+        sign = vec3(-one, -one, -one)
+        if sticky == 0:
+            sign = vec3(wp.where(axis == 0, -one, one), wp.where(axis == 1, -one, one), wp.where(axis == 2, -one, one))
+        return sign
+
+    @wp.func
+    def folded(at: wp.vec3i, window: wp.array(dtype=int), walls: wp.array(dtype=int), grid: wp.array(dtype=vec4)):
+        total = vec4()
+        for c in range(27):  # along each axis: itself, its image in the lower wall, its image in the upper wall
+            choice = wp.vec3i(c % 3, (c / 3) % 3, c / 9)
+            image = at - wp.vec3i(window[0], window[1], window[2])
+            sign = vec3(real(1.0), real(1.0), real(1.0))
+            there = 1
+            for axis in range(3):
+                if choice[axis] == 1:
+                    if at[axis] != walls[axis] + 1:
+                        there = 0
+                    image[axis] = image[axis] - 2
+                    sign = wp.cw_mul(sign, flip(axis, walls[6 + axis]))
+                if choice[axis] == 2:
+                    if at[axis] != walls[3 + axis] - 1:
+                        there = 0
+                    image[axis] = image[axis] + 2
+                    sign = wp.cw_mul(sign, flip(axis, walls[9 + axis]))
+                if image[axis] < 0 or image[axis] >= window[3 + axis]:
+                    there = 0
+            if there == 1:
+                node = grid[(image[0] * window[4] + image[1]) * window[5] + image[2]]
+                total = total + vec4(sign[0] * node[0], sign[1] * node[1], sign[2] * node[2], node[3])
+        return total
+
+    return flip, folded
+
+
+@cache
+def _update(real, hooks: tuple[Hook, ...], mirrored: bool) -> wp.Kernel:
+    vec3, vec4 = vector(real), vector4(real)
+    flip, folded = _mirror(real)
     count = len(hooks)
     functions, a, b, _ = zip(*hooks) if hooks else ((), (), (), ())
 
@@ -82,6 +128,7 @@ def _update(real, hooks: tuple[Hook, ...]) -> wp.Kernel:
         window: wp.array(dtype=int),
         clock: wp.array2d(dtype=real),  # columns 0: dt [s], 1: exp(-damping dt)
         row: wp.array(dtype=int),
+        walls: wp.array(dtype=int),
         q: wp.array(dtype=real),
         grid: wp.array(dtype=vec4),
         # out
@@ -89,17 +136,35 @@ def _update(real, hooks: tuple[Hook, ...]) -> wp.Kernel:
     ):
         n = wp.tid() + first
         r = row[0]
+        k = n % window[5]
+        j = (n / window[5]) % window[4]
+        i = n / (window[5] * window[4])
+        at = wp.vec3i(window[0] + i, window[1] + j, window[2] + k)
         node = grid[n]
+        sign = vec3(real(1.0), real(1.0), real(1.0))
+        if wp.static(mirrored):
+            near = 0
+            for axis in range(3):
+                below, above = at[axis] - walls[axis], walls[3 + axis] - at[axis]
+                if below == -1:
+                    at[axis] = at[axis] + 2
+                    sign = wp.cw_mul(sign, flip(axis, walls[6 + axis]))
+                elif above == -1:
+                    at[axis] = at[axis] - 2
+                    sign = wp.cw_mul(sign, flip(axis, walls[9 + axis]))
+                if wp.abs(below) == 1 or wp.abs(above) == 1:
+                    near = 1
+            if near == 1:
+                node = folded(at, window, walls, grid)
         m = node[3]
         v = vec3()
         if m > mass_floor:
             v = clock[r, 1] * (vec3(node[0], node[1], node[2]) / m + clock[r, 0] * gravity)
-            k = n % window[5]
-            j = (n / window[5]) % window[4]
-            i = n / (window[5] * window[4])
-            x = origin + dx * vec3(real(window[0] + i), real(window[1] + j), real(window[2] + k))
+            x = origin + dx * vec3(real(at[0]), real(at[1]), real(at[2]))
             for h in range(wp.static(count)):
                 v = wp.static(functions[h])(x, v, q, wp.static(a[h]), clock, r, wp.static(b[h]))
+        if wp.static(mirrored):
+            v = wp.cw_mul(sign, v)
         node_velocity[n] = v
 
     return update_kernel
@@ -207,6 +272,7 @@ class Substeps:
         pushes: tuple[Hook, ...],
         nodes: tuple[Hook, ...],
         steers: tuple[Hook, ...],
+        walls: Sequence[int] | None,  # [12] of `_mirror`; None: no wall mirrors
         material: wp.Function,
         memory_rows: int,
         longest_run: int,  # substeps
@@ -220,7 +286,7 @@ class Substeps:
         self.mass_floor = 1e-12 * float(mass.mean())
         self.kernels = {
             "scatter": transfer.scatter(self.real),
-            "update": _update(self.real, nodes),
+            "update": _update(self.real, nodes, walls is not None),
             "gather": transfer.gather(self.real),
             "advance": _advance(self.real, material),
         }
@@ -240,6 +306,10 @@ class Substeps:
             "selection": wp.from_torch(selection) if len(selection) else self._zeros((1, self.n), real),
             "coefficients": wp.from_torch(coefficients),
         }
+        self.mirrored = walls is not None
+        self.walls = self._zeros(12, wp.int32)
+        if walls is not None:
+            self.walls.assign(np.array(walls, np.int32))
         self.parameter_count, self.row_count = len(q), len(coefficients)
         self.v_pushed = self._zeros(self.n, vec3) if pushes else None
         self.clock = self._zeros((longest_run, 2 + signals), real)
@@ -287,7 +357,7 @@ class Substeps:
                 self._set_row(w, s)
                 self._scatter_phase(launch)
                 wait()
-                self._update_phase(launch, *dims[w])
+                self._update_phase(launch, *dims[w], wait)
                 wait()
                 for name in ("gather", "steer", "advance"):
                     if name in launch:
@@ -356,16 +426,20 @@ class Substeps:
                 self._scatter_phase(launch)
                 self._span(adjoint["clear_private"], 0, self.node_count)
                 wait()
-                self._update_phase(launch, *dims[w])
+                self._update_phase(launch, *dims[w], wait)
                 wait()
                 for name in ("advance", "steer", "gather"):
                     if name in adjoint:
                         adjoint[name].launch()
                 wait()
                 first, count = dims[w]
+                if count and self.workers > 1:
+                    self._span(adjoint["total"], first, count)
+                if self.mirrored:
+                    wait()
+                    # the adjoint adds to nodes of other workers: the first one does them all
+                    first, count = (0, self.node_count) if w == 0 else (0, 0)
                 if count:
-                    if self.workers > 1:
-                        self._span(adjoint["total"], first, count)
                     self._span(adjoint["clear_grid"], first, count)
                     self._span(adjoint["update"], first, count)
                 wait()
@@ -418,7 +492,8 @@ class Substeps:
                 [self.grid[w], self.lost[w]],
             ),
             "update": (
-                [0, self.dx, self.origin, self.gravity, self.mass_floor, self.window, *clock, c["q"], self.grid[0]],
+                [0, self.dx, self.origin, self.gravity, self.mass_floor, self.window]
+                + [*clock, self.walls, c["q"], self.grid[0]],
                 [self.node_velocity],
             ),
             "gather": ([first, self.dx, self.window, *place, self.node_velocity], [b["v_gathered"], b["L_gathered"]]),
@@ -454,7 +529,7 @@ class Substeps:
             hooked = [None, None, None, None, adjoint["rest"], q, a["u"]]
             adjoints = {
                 "push": ([*hooked, a["v"]], [adjoint["v_pushed"]]),
-                "update": ([*[None] * 8, q, self.adjoint_grid], [self.adjoint_node_velocity[0]]),
+                "update": ([*[None] * 9, q, self.adjoint_grid], [self.adjoint_node_velocity[0]]),
                 "steer": ([*hooked, b["v_gathered"], b["L_gathered"]], [b["v"], b["L"]]),
                 "advance": (
                     [None] * 3 + [a["u"], b["v"], b["L"], a["H"], adjoint["coefficients"], a["memory"]],
@@ -509,10 +584,12 @@ class Substeps:
         self._span(launch["clear"], 0, self.node_count)
         launch["scatter"].launch()
 
-    def _update_phase(self, launch: dict[str, wp.Launch], first: int, count: int) -> None:
+    def _update_phase(self, launch: dict[str, wp.Launch], first: int, count: int, wait: Callable[[], object]) -> None:
+        if count and self.workers > 1:
+            self._span(launch["total"], first, count)
+        if self.mirrored:
+            wait()  # nodes read those of other workers
         if count:
-            if self.workers > 1:
-                self._span(launch["total"], first, count)
             self._span(launch["update"], first, count)
 
     def _span(self, launch: wp.Launch, first: int, count: int) -> None:

@@ -11,6 +11,7 @@ time and are computed on the host in float64 for every substep, so that a window
 
 import abc
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -30,6 +31,16 @@ class Setting:
     lower: Vector  # corner of the simulated region [m]
     upper: Vector
     dx: float  # [m]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wall:
+    """A resting plane across an axis of the grid, without friction; it may mirror (`mirror_nodes`)."""
+
+    axis: int  # 0, 1, 2
+    side: int  # +1: the material is above the plane, -1: below
+    place: float  # of the plane along the axis [m]
+    sticky: bool  # else it slips
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,6 +71,10 @@ class AbstractBoundary(abc.ABC):
         """Weight per particle for `acceleration` and `steer`; 0 leaves the particle alone."""
         return torch.zeros(len(setting.position), dtype=torch.float64)
 
+    def walls(self, setting: Setting) -> tuple[Wall, ...]:
+        """Planes the solver may mirror at; `node` must hold on and behind them all the same."""
+        return ()
+
     def node(self, real: type) -> wp.Function | None:
         return None
 
@@ -68,6 +83,34 @@ class AbstractBoundary(abc.ABC):
 
     def steer(self, real: type) -> wp.Function | None:
         return None
+
+
+def mirror_nodes(boundaries: Sequence[AbstractBoundary], setting: Setting) -> list[int] | None:
+    """Where the grid is mirrored: per axis the node of the lower wall, then of the upper one, then 1 for each that is
+    sticky (12 numbers); None if there is no such wall.
+
+    Velocities zeroed on and behind a wall leave half a cell of material before it too stiff: an error of first order.
+    A wall that mirrors folds momentum and mass of the layer of nodes behind it onto the layer before it, the momentum
+    across it (all of it, if sticky) reversed, and the velocities back: the trial functions then vanish on the plane
+    itself, an error of second order. It asks for a plane on nodes (to 1e-3 dx) with no particle behind it at rest, and
+    for one cell between two walls; another wall keeps the rule of its `node`, as all but the innermost of several do.
+    """
+    far = 2**28
+    nodes, sticky = [-far] * 3 + [far] * 3, [0] * 6
+    for wall in (wall for boundary in boundaries for wall in boundary.walls(setting)):
+        place = (wall.place - setting.lower[wall.axis]) / setting.dx
+        behind = wall.side * (setting.position[:, wall.axis] - wall.place) < 0
+        if abs(place - round(place)) > 1e-3 or bool(behind.any()):
+            continue
+        at, node = wall.axis + (0 if wall.side > 0 else 3), round(place)
+        if node == nodes[at]:
+            sticky[at] |= int(wall.sticky)
+        elif wall.side * (node - nodes[at]) > 0:
+            nodes[at], sticky[at] = node, int(wall.sticky)
+    for axis in range(3):
+        if nodes[axis] >= nodes[axis + 3]:
+            nodes[axis], nodes[axis + 3] = -far, far
+    return nodes + sticky if any(abs(node) != far for node in nodes) else None
 
 
 def require(condition: bool, boundary: AbstractBoundary, field: str, remedy: str) -> None:

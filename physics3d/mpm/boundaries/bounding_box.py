@@ -1,7 +1,8 @@
 """Bounding box: six walls around the simulated region, or around a box of one's own.
 
 On nodes at or beyond a wall: sticky, v = 0; slip, no velocity across the wall; separate, none outwards. A corner obeys
-all its walls. Nothing passes, so particles cannot leave the region.
+all its walls. Nothing passes, so particles cannot leave the region. Sticky and slip walls on nodes of the grid mirror
+(`mirror_nodes`), which is what their accuracy comes from.
 """
 
 import functools
@@ -36,6 +37,16 @@ class BoundingBox(base.AbstractBoundary):
         upper = torch.tensor(self.upper or setting.upper, dtype=torch.float64)
         slack = 1e-3 * setting.dx  # a node on the wall belongs to it whatever the rounding
         return torch.cat([lower + slack, upper - slack])
+
+    def walls(self, setting: base.Setting) -> tuple[base.Wall, ...]:
+        if self.kind == "separate":
+            return ()
+        sides = ((1, self.lower or setting.lower), (-1, self.upper or setting.upper))
+        return tuple(
+            base.Wall(axis=axis, side=side, place=corner[axis], sticky=self.kind == "sticky")
+            for side, corner in sides
+            for axis in range(3)
+        )
 
     def node(self, real: type) -> wp.Function:
         return _node(real, self.kind)

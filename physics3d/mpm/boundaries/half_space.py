@@ -5,10 +5,12 @@ For nodes behind the plane, n . (x - point) <= 0, with v_n = v . n and v_t = v -
     slip       v = friction(v_t, |v_n|)
     separate   the same where v_n < 0, else v unchanged
     friction(v_t, j) = v_t max(0, 1 - mu j/|v_t|)
+Ground that sticks, or slips without friction, across an axis and on nodes of the grid mirrors (`mirror_nodes`).
 Source: Stomakhin et al. (2013) A material point method for snow simulation, sec. 8.
 """
 
 import functools
+import math
 from dataclasses import dataclass
 
 import torch
@@ -48,6 +50,15 @@ class HalfSpace(base.AbstractBoundary):
                 torch.tensor(rest, dtype=torch.float64),
             ]
         )
+
+    def walls(self, setting: base.Setting) -> tuple[base.Wall, ...]:
+        length = math.hypot(*self.normal)
+        axis = max(range(3), key=lambda i: abs(self.normal[i]))
+        slips = self.kind == "slip" and self.friction == 0
+        if abs(self.normal[axis]) < (1 - 1e-12) * length or not (slips or self.kind == "sticky"):
+            return ()
+        side = 1 if self.normal[axis] > 0 else -1
+        return (base.Wall(axis=axis, side=side, place=self.point[axis], sticky=not slips),)
 
     def node(self, real: type) -> wp.Function:
         return _node(real, self.kind)
