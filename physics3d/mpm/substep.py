@@ -485,6 +485,7 @@ class Substeps:
         clock = [self.clock, self.row[w]]
         hooked = [first, *clock, c["selection"], c["rest"], c["q"], a["u"]]
         place = [c["cell"], c["offset"], a["u"]]
+        onto = [self.walls, c["q"], self.grid[0]]
         return {
             "push": ([*hooked, a["v"]], [self.v_pushed]),
             "scatter": (
@@ -492,8 +493,7 @@ class Substeps:
                 [self.grid[w], self.lost[w]],
             ),
             "update": (
-                [0, self.dx, self.origin, self.gravity, self.mass_floor, self.window]
-                + [*clock, self.walls, c["q"], self.grid[0]],
+                [0, self.dx, self.origin, self.gravity, self.mass_floor, self.window, *clock, *onto],
                 [self.node_velocity],
             ),
             "gather": ([first, self.dx, self.window, *place, self.node_velocity], [b["v_gathered"], b["L_gathered"]]),
