@@ -84,22 +84,22 @@ def _mirror(real) -> tuple[wp.Function, wp.Function]:
     @wp.func
     def folded(at: wp.vec3i, window: wp.array(dtype=int), walls: wp.array(dtype=int), grid: wp.array(dtype=vec4)):
         total = vec4()
-        for c in range(27):  # along each axis: itself, its image in the lower wall, its image in the upper wall
-            choice = wp.vec3i(c % 3, (c / 3) % 3, c / 9)
+        # along each axis: itself, then its images in the lower and in the upper wall where it has them
+        low = wp.vec3i(0, 0, 0)
+        ways = wp.vec3i(1, 1, 1)
+        for axis in range(3):
+            low[axis] = wp.where(at[axis] == walls[axis] + 1, 1, 0)
+            ways[axis] = 1 + low[axis] + wp.where(at[axis] == walls[3 + axis] - 1, 1, 0)
+        for c in range(ways[0] * ways[1] * ways[2]):
+            choice = wp.vec3i(c % ways[0], (c / ways[0]) % ways[1], c / (ways[0] * ways[1]))
             image = at - wp.vec3i(window[0], window[1], window[2])
             sign = vec3(real(1.0), real(1.0), real(1.0))
             there = 1
             for axis in range(3):
-                if choice[axis] == 1:
-                    if at[axis] != walls[axis] + 1:
-                        there = 0
-                    image[axis] = image[axis] - 2
-                    sign = wp.cw_mul(sign, flip(axis, walls[6 + axis]))
-                if choice[axis] == 2:
-                    if at[axis] != walls[3 + axis] - 1:
-                        there = 0
-                    image[axis] = image[axis] + 2
-                    sign = wp.cw_mul(sign, flip(axis, walls[9 + axis]))
+                if choice[axis] > 0:
+                    lower = choice[axis] == 1 and low[axis] == 1
+                    image[axis] = image[axis] + wp.where(lower, -2, 2)
+                    sign = wp.cw_mul(sign, flip(axis, walls[wp.where(lower, 6, 9) + axis]))
                 if image[axis] < 0 or image[axis] >= window[3 + axis]:
                     there = 0
             if there == 1:
