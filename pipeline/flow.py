@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.server import server
-from pipeline.stage import Filed, Part, Step, as_task, build, damage, peek
+from pipeline.stage import Filed, Part, Step, as_task, build, damage, peek, usual_seconds
 
 STAGES = ("capture", "guess", "reconstruct", "segment", "fill", "learn", "simulate", "render", "evaluate")
 
@@ -33,7 +33,7 @@ def first(config: dict[str, Any], shelf: Path) -> Step:
 
 def plan(config: dict[str, Any], capture: Step) -> Plan:
     """The graph of a scene whose capture has been filed."""
-    without = left_out(config, peek(capture.folder))
+    without = left_out(config, peek(capture.folder), capture.shelf)
     steps = [capture]
 
     def step(name: str, *inputs: Any, stage: str | None = None) -> Step:
@@ -60,8 +60,9 @@ def plan(config: dict[str, Any], capture: Step) -> Plan:
     return Plan(steps, without)
 
 
-def left_out(config: dict[str, Any], capture: dict[str, Any]) -> dict[str, str]:
-    """Stage -> why this scene, or this method, does without it. `capture` is the stored Capture, see `peek`."""
+def left_out(config: dict[str, Any], capture: dict[str, Any], shelf: Path) -> dict[str, str]:
+    """Stage -> why this scene, or this method, does without it, and the time that saves, as far as earlier runs on this
+    shelf tell. `capture` is the stored Capture, see `peek`."""
     why = {name: f"the configuration says {name}=null" for name in STAGES if config.get(name) is None}
     roles = {take["role"] for take in capture["takes"]}
     if capture["gaussians"] is not None:
@@ -72,6 +73,10 @@ def left_out(config: dict[str, Any], capture: dict[str, Any]) -> dict[str, str]:
         why.setdefault("learn", "the scene has no recorded motion to learn from")
     if not roles:
         why["evaluate"] = "the scene has no recorded motion to compare with"
+    for name in why:
+        usual = usual_seconds(shelf, name)
+        if usual is not None:
+            why[name] += f"; it took {usual:.0f} s in other runs here"
     return why
 
 

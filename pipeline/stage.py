@@ -17,6 +17,7 @@ import os
 import platform
 import resource
 import shutil
+import statistics
 import time
 import traceback
 from collections.abc import Callable, Iterator
@@ -110,6 +111,15 @@ def damage(step: Step, verify: bool = False) -> str | None:
 
 def manifest(step: Step) -> dict[str, Any]:
     return json.loads((step.folder / MANIFEST).read_text())
+
+
+def usual_seconds(shelf: Path, stage: str) -> float | None:
+    """Median time of the results of a stage that are filed on this shelf [s]; None if there is none."""
+    times = []
+    for path in (shelf / stage).glob(f"*/{MANIFEST}"):
+        with suppress(OSError, ValueError, KeyError):
+            times.append(json.loads(path.read_text())["seconds"])
+    return statistics.median(times) if times else None
 
 
 def load(source: Any, device: str, verify: bool = False) -> Any:

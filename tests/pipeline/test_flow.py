@@ -82,6 +82,19 @@ def test_a_scene_leaves_out_what_it_does_not_need_and_says_why(tmp_path, changes
     assert all(missing[name] in why for name, why in whole.left_out.items())
 
 
+def test_what_is_left_out_says_the_time_it_took_elsewhere(tmp_path):
+    config = configuration(tmp_path)
+    for folder, seconds in (("a", 10.0), ("b", 20.0), ("c", 90.0)):
+        place = tmp_path / "artifacts" / "segment" / folder
+        place.mkdir(parents=True)
+        (place / "manifest.json").write_text(json.dumps({"seconds": seconds}))
+    config["capture"]["single_object"] = True
+    capture = first(config, tmp_path / "artifacts")
+    run(capture, "cpu")
+    # the median of the three
+    assert "20 s" in plan(config, capture).left_out["segment"]
+
+
 def test_initial_material_is_simulated_without_what_was_learned(tmp_path):
     config = configuration(tmp_path)
     capture = first(config, tmp_path / "artifacts")
