@@ -59,7 +59,9 @@ def main() -> None:
                 solid=solid,
                 interior=True,
                 sheet_thickness=None,
+                isolated="keep",
                 drop_pieces_below=0.0,
+                attach=False,
                 log=Log(None),
             )
             seconds = time.perf_counter() - started

@@ -11,6 +11,7 @@ A reconstruction puts Gaussians on the visible surface only; a simulated body ne
                plus one per spacing^2 of thin surface that no cell covers, V_p = area * thickness
 
 so that sum V_p is the volume of the body. Cells of less than a quarter give their volume to the nearest particle.
+Isolated pieces are named, and joined to the rest, dropped or kept; particles beside static Gaussians are marked.
 Poisson reconstruction: Kazhdan, Hoppe (2013). All lengths in metres.
 """
 
@@ -29,6 +30,9 @@ from physics3d.artifact import AbstractArtifact, require_finite
 from physics3d.gaussians.deform import Embedding, embed
 from physics3d.gaussians.model import Gaussians
 from physics3d.log import Log
+from physics3d.mpm.boundaries.base import AbstractBoundary
+from physics3d.mpm.boundaries.fixed_region import FixedRegion
+from physics3d.mpm.boundaries.held_particles import HeldParticles
 from physics3d.open3d_import import open3d
 
 DIRECTIONS = np.array(
@@ -37,6 +41,10 @@ DIRECTIONS = np.array(
 MOST_CELLS = 160  # along one side of the lattice
 LEAST_FRACTION = 0.25  # a cell filled less than this is no particle of its own
 SUBDIVISION = 4  # samples along each side of a boundary cell
+ISOLATED = ("attach", "drop", "keep")  # what may become of a piece
+JOINT = 4.0  # widest gap that is bridged [spacings]: two cells of the simulation grid
+CONTACT = 1.0  # a particle nearer to a static Gaussian is held by it [spacings]
+SPECK = 0.05  # static clusters of less than this share are mistakes of the segmentation and hold nothing
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,14 +55,25 @@ class Body(AbstractArtifact):
     interior: Bool[Tensor, " p"]  # put there by filling: farther than a spacing from every Gaussian
     spacing: float  # distance between neighbours [m]
     embedding: Embedding  # how the moving Gaussians ride on the particles
+    attached: Bool[Tensor, " p"] | None = None  # beside something static, which holds them there; None: nothing is
+
+    def held(self, boundaries: tuple[AbstractBoundary, ...]) -> tuple[AbstractBoundary, ...]:
+        """What holds the body where it is attached: nothing if the scene's `boundaries` say where it is fixed."""
+        if self.attached is None or not bool(self.attached.any()):
+            return ()
+        if any(isinstance(b, FixedRegion | HeldParticles) for b in boundaries):
+            return ()
+        return (HeldParticles(position=self.position[self.attached]),)
 
     def check(self) -> None:
         p = len(self.position)
         if p == 0:
             raise ValueError("Body: no particle at all; lower fill.opacity or fill.spacing")
-        if self.position.shape != (p, 3) or any(len(v) != p for v in (self.volume, self.part, self.interior)):
+        if self.position.shape != (p, 3) or any(
+            v is not None and len(v) != p for v in (self.volume, self.part, self.interior, self.attached)
+        ):
             raise ValueError(
-                f"Body: position {tuple(self.position.shape)}, volume, part and interior must have {p} rows"
+                f"Body: position {tuple(self.position.shape)}, volume, part, interior and attached must have {p} rows"
             )
         require_finite("Body.position", self.position)
         require_finite("Body.volume", self.volume)
@@ -206,18 +225,23 @@ def fill(
     solid: AbstractSolid,
     interior: bool,
     sheet_thickness: float | None,
+    isolated: str,
     drop_pieces_below: float,
+    attach: bool,
     log: Log,
 ) -> Body:
     """Particles for the Gaussians with label > 0 (part = label - 1), and the embedding of all of them.
 
     spacing [m]; Gaussians below `opacity` become no particles but are embedded; `interior` False leaves a shell;
     `sheet_thickness` [m] of thin parts, None takes sqrt(12) times the median least deviation of their Gaussians;
-    disconnected pieces with less than the share `drop_pieces_below` of the volume are dropped.
+    isolated pieces with less than the share `drop_pieces_below` of the volume are dropped, of the others becomes what
+    `isolated` says, see `join_pieces`; `attach` marks the particles beside static Gaussians.
     Raises ValueError if nothing moves, or the lattice would be too large.
     """
     if not spacing > 0:
         raise ValueError(f"fill.spacing is {spacing:g} m, must be > 0; half a cell of the simulation grid is right")
+    if isolated not in ISOLATED:
+        raise ValueError(f"fill.isolated is {isolated!r}; take one of {', '.join(ISOLATED)}")
     which = torch.nonzero(label > 0).flatten()
     if len(which) == 0:
         raise ValueError(
@@ -274,19 +298,24 @@ def fill(
         volume = np.concatenate([volume, thin_area * thickness])
         inner = np.concatenate([inner, np.zeros(len(thin_position), bool)])
 
-    keep = report_pieces(position, volume, spacing, drop_pieces_below, log)
-    position, volume, inner = position[keep], volume[keep], inner[keep]
-
     _, nearest = cKDTree(shown.mean.double().numpy()).query(position)
-    part = (label[which][reliable][torch.from_numpy(nearest)] - 1).to(torch.int32)
-    position = torch.from_numpy(position).to(torch.float32)  # type: ignore[assignment]
+    part = (label[which][reliable][torch.from_numpy(nearest)] - 1).numpy()
+    keep, bridge, bridge_part = join_pieces(position, volume, part, spacing, isolated, drop_pieces_below, log)
+    position = np.concatenate([position[keep], bridge])
+    volume = np.concatenate([volume[keep], np.full(len(bridge), spacing**3)])
+    inner = np.concatenate([inner[keep], np.zeros(len(bridge), bool)])
+    part = np.concatenate([part[keep], bridge_part])
+    attached = touching(position, spacing, static, log) if attach else None
+
+    placed, of = torch.from_numpy(position).to(torch.float32), torch.from_numpy(part).to(torch.int32)
     return Body(
-        position=position,
+        position=placed,
         volume=torch.from_numpy(volume).to(torch.float32),
-        part=part,
+        part=of,
         interior=torch.from_numpy(inner),
         spacing=float(spacing),
-        embedding=embed(moving.mean.to(torch.float32), which, position, spacing),
+        embedding=embed(moving.mean.to(torch.float32), which, placed, spacing, parts=(label[which] - 1, of)),
+        attached=None if attached is None else torch.from_numpy(attached),
     )
 
 
@@ -441,23 +470,107 @@ def sample_area(point: np.ndarray, normal: np.ndarray, spacing: float, tree: cKD
     return area
 
 
-def report_pieces(position: np.ndarray, volume: np.ndarray, spacing: float, drop_below: float, log: Log) -> np.ndarray:
-    """Boolean mask of the particles to keep; names every disconnected piece (gaps above two spacings) in the log."""
-    pairs = cKDTree(position).query_pairs(2 * spacing, output_type="ndarray")
+def clusters(position: np.ndarray, gap: float) -> np.ndarray:
+    """Number [n] of each point's connected piece; neighbours are nearer than `gap` [m], piece 0 has most points."""
+    pairs = cKDTree(position).query_pairs(gap, output_type="ndarray")
     n = len(position)
-    links = sparse.coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
-    count, piece = sparse.csgraph.connected_components(links, directed=False)
-    log.metric("pieces", count)
+    links = sparse.coo_matrix((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+    _, piece = sparse.csgraph.connected_components(links, directed=False)
+    rank = np.argsort(np.argsort(-np.bincount(piece), kind="stable"), kind="stable")
+    return rank[piece]
+
+
+def join_pieces(
+    position: np.ndarray,
+    volume: np.ndarray,
+    part: np.ndarray,
+    spacing: float,
+    isolated: str,
+    drop_below: float,
+    log: Log,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(particles to keep [p] bool, positions of new ones [b, 3], their part [b]); every piece is named in the log.
+
+    Pieces lie more than two spacings (a cell) apart. Those below `drop_below` of the volume are dropped, and so are all
+    but the largest if `isolated` is "drop"; their Gaussians ride on what remains. "attach" bridges a gap of at most
+    JOINT spacings to a piece of the same part by particles a spacing apart; wider ones stay, as with "keep".
+    """
+    piece = clusters(position, 2 * spacing)
+    count = int(piece.max()) + 1
     share = np.bincount(piece, weights=volume) / volume.sum()
-    dropped = share < drop_below
-    dropped[share.argmax()] = False
-    order = np.argsort(-share)
-    for k in order[1:6]:
-        at = ", ".join(f"{v:.3f}" for v in position[piece == k].mean(0))
-        log.info(
-            f"isolated piece at ({at}) m: {int((piece == k).sum())} particles, {100 * share[k]:.2g} % of the volume, "
-            + ("dropped" if dropped[k] else "kept")
+    main = int(share.argmax())
+    log.metric("pieces", count)
+    keep, bridges, of = np.ones(len(position), bool), [np.zeros((0, 3))], [np.zeros(0, part.dtype)]
+    joined = piece == main
+    lines = []
+    for k in sorted(set(range(count)) - {main}, key=lambda k: -share[k]):
+        own = piece == k
+        if isolated == "drop" or share[k] < drop_below:
+            keep[own], fate = False, "dropped; its Gaussians ride on the rest"
+        elif isolated == "keep":
+            joined |= own
+            fate = "kept, it moves on its own"
+        else:
+            kind = np.bincount(part[own] - part.min()).argmax() + part.min()
+            bridge, gap = bridged(position[own], position[joined & (part == kind)], spacing)
+            joined |= own
+            if gap <= JOINT * spacing:
+                bridges.append(bridge)
+                of.append(np.full(len(bridge), kind, part.dtype))
+                fate = f"attached across {1e3 * gap:.3g} mm by {len(bridge)} particles"
+            else:
+                fate = f"kept, it moves on its own: {1e3 * gap:.3g} mm from the rest of its part"
+        at = ", ".join(f"{v:.3f}" for v in position[own].mean(0))
+        lines.append(
+            f"isolated piece at ({at}) m: {int(own.sum())} particles, {100 * share[k]:.2g} % of the volume, {fate}"
         )
-    if count > 6:
-        log.info(f"{count - 6} more isolated pieces, {int(dropped[order[6:]].sum())} of them dropped")
-    return ~dropped[piece]
+    for line in lines[:8]:
+        log.info(line)
+    if len(lines) > 8:
+        log.info(f"{len(lines) - 8} more isolated pieces, smaller than these; {int((~keep).sum())} particles dropped")
+    return keep, np.concatenate(bridges), np.concatenate(of)
+
+
+def bridged(piece: np.ndarray, rest: np.ndarray, spacing: float) -> tuple[np.ndarray, float]:
+    """Points [b, 3] a spacing apart that fill the gap where it is narrowest, and its width [m]; inf without a rest."""
+    if len(rest) == 0:
+        return np.zeros((0, 3)), np.inf
+    distance, nearest = cKDTree(rest).query(piece)
+    gap = distance.min()
+    ends = np.flatnonzero(distance < gap + 0.5 * spacing)
+    between = np.linspace(0, 1, max(2, round(gap / spacing) + 1))[1:-1, None, None]
+    points = (piece[ends] + between * (rest[nearest[ends]] - piece[ends])).reshape(-1, 3)
+    _, cell = np.unique(np.round(points / spacing).astype(np.int64), axis=0, return_inverse=True)
+    cell = cell.reshape(-1)
+    return np.stack([np.bincount(cell, weights=points[:, k]) for k in range(3)], 1) / np.bincount(cell)[:, None], gap
+
+
+def touching(position: np.ndarray, spacing: float, static: Gaussians, log: Log) -> np.ndarray:
+    """Bool [p]: particles within CONTACT spacings of a static Gaussian that is part of more than a speck."""
+    attached = np.zeros(len(position), bool)
+    if len(static):
+        reach = CONTACT * spacing
+        solid = static.select(torch.from_numpy(not_specks(static.mean.double().numpy(), 4 * spacing)))
+        point, _ = spread(solid, spacing / 2)
+        near = ((point > position.min(0) - reach) & (point < position.max(0) + reach)).all(1)
+        if near.any():
+            attached = cKDTree(point[near]).query(position, distance_upper_bound=reach)[0] < reach
+    log.metric("attached", int(attached.sum()))
+    if not attached.any():
+        log.info("nothing static touches the body: it is held nowhere, unless the scene names a fixed region")
+        return attached
+    where = position[attached]
+    patch = clusters(where, 3 * spacing)
+    for k in range(min(int(patch.max()) + 1, 8)):
+        at = ", ".join(f"{v:.3f}" for v in where[patch == k].mean(0))
+        log.info(f"attached at ({at}) m: {int((patch == k).sum())} particles beside static Gaussians are held there")
+    if patch.max() >= 8:
+        log.info(f"and at {int(patch.max()) - 7} smaller places")
+    return attached
+
+
+def not_specks(point: np.ndarray, cell: float) -> np.ndarray:
+    """Bool [n]: points of clusters of cells [m] that hold at least the share SPECK of all points."""
+    cells, of = np.unique(np.floor(point / cell).astype(np.int64), axis=0, return_inverse=True)
+    cluster = clusters(cells.astype(float), 1.8)[of.reshape(-1)]
+    return (np.bincount(cluster) >= SPECK * len(point))[cluster]

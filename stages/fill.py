@@ -19,10 +19,14 @@ class Fill:
     interior: bool = True  # False leaves a shell one to two particles thick
     opacity: float = 0.1  # fainter Gaussians ride along but become no particles
     sheet_thickness: float | None = None  # of petals and leaves [m]; null: from the flatness of their Gaussians
-    drop_pieces_below: float = 0.01  # disconnected pieces with less than this share of the volume are dropped
+    isolated: str = "attach"  # attach | drop | keep: what becomes of pieces more than a cell away from the rest
+    drop_pieces_below: float = 0.01  # isolated pieces with less than this share of the volume are dropped
+    attach: str = "auto"  # auto | none: hold what touches static Gaussians, where the scene names no fixed region
 
     def __call__(self, gaussians: Gaussians, segmentation: Segmentation | None, *, log: Log) -> Body:
         """Without a segmentation everything visible moves. Raises ValueError if nothing does."""
+        if self.attach not in ("auto", "none"):
+            raise ValueError(f"fill.attach is {self.attach!r}; take auto or none")
         if segmentation is None:
             label = (gaussians.opacity > VISIBLE).to(torch.int32)
         elif len(segmentation.label) != len(gaussians):
@@ -39,7 +43,9 @@ class Fill:
             solid=self.solid,
             interior=self.interior,
             sheet_thickness=self.sheet_thickness,
+            isolated=self.isolated,
             drop_pieces_below=self.drop_pieces_below,
+            attach=self.attach == "auto",
             log=log,
         )
         log.metric("particles", len(body.position))
@@ -63,12 +69,15 @@ def slices(gaussians: Gaussians, label: torch.Tensor, body: Body):
         near = (mean[:, k] - middle[k]).abs() < body.spacing
         panel.scatter(mean[near, a], mean[near, b], s=2, color="0.7", label="Gaussians")
         near = (body.position[:, k] - middle[k]).abs() < body.spacing
+        held = body.attached if body.attached is not None else torch.zeros_like(body.interior)
         for chosen, name, colour in (
-            (body.interior, "interior", "tab:orange"),
-            (~body.interior, "surface", "tab:blue"),
+            (body.interior & ~held, "interior", "tab:orange"),
+            (~body.interior & ~held, "surface", "tab:blue"),
+            (held, "held: touches what is static", "tab:red"),
         ):
             at = body.position[near & chosen]
-            panel.scatter(at[:, a], at[:, b], s=8, color=colour, label=name)
+            if len(at) or chosen is not held:
+                panel.scatter(at[:, a], at[:, b], s=8, color=colour, label=name)
         panel.set_aspect("equal")
         panel.set_xlim(body.position[:, a].min() - 2 * body.spacing, body.position[:, a].max() + 2 * body.spacing)
         panel.set_ylim(body.position[:, b].min() - 2 * body.spacing, body.position[:, b].max() + 2 * body.spacing)

@@ -164,7 +164,7 @@ class Learn:
                 rest,
                 volume,
                 velocity=field.velocity(theta),
-                excitation=take.excitation,
+                excitation=(*body.held(self.world.boundaries), *take.excitation),
                 frames=len(indices),
                 frame_dt=int(indices[1]) / take.fps,
                 device=self.device,

@@ -36,7 +36,7 @@ class Simulate:
                 body.position,
                 body.volume,
                 velocity=estimate.velocity,
-                excitation=excited(self.excitation, self.force),
+                excitation=(*body.held(self.world.boundaries), *excited(self.excitation, self.force)),
                 frames=self.frames,
                 frame_dt=1 / self.fps,
                 device=self.device,

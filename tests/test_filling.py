@@ -51,7 +51,9 @@ WITH = {
     "solid": Poisson(),
     "interior": True,
     "sheet_thickness": None,
+    "isolated": "keep",
     "drop_pieces_below": 0.0,
+    "attach": False,
     "log": Log(None),
 }
 
