@@ -59,7 +59,7 @@ def test_the_floor_is_the_level_plane_below_and_not_the_wall(rng):
 
 
 def test_the_sharpest_frame_of_each_stretch_of_a_video_is_taken(tmp_path, rng):
-    """Frames of noise, blurred but for every fifth: 4 stretches of 5, each with one sharp frame of its own brightness."""
+    """Frames of noise, blurred but for every fifth: 4 stretches of 5, each with one sharp frame, ever brighter."""
     import cv2
 
     writer = cv2.VideoWriter(str(tmp_path / "a.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 10, (96, 64))
