@@ -128,24 +128,32 @@ def log1p_extended(real: type, floor: float) -> wp.Function:
 
 @functools.cache
 def log_det(real: type) -> wp.Function:
-    """ln det(I + X) of a positive semidefinite I + X, its tangent below det = 1e-12 (all lengths a hundredth)."""
+    """ln det(I + X) of a positive semidefinite I + X, its tangent below det = 1e-12 (all lengths a hundredth), or below
+    what rounding leaves of the determinant of very unequal stretches."""
     mat33 = matrix_type(real)
     volume_change_, cofactor_, log1p_ = volume_change(real), cofactor(real), log1p(real)
-    floor = real(1e-12)
+    round_off = real(5e-7 if real is wp.float32 else 1e-15)
+
+    @wp.func(name=f"least_det_{real.__name__}")
+    def least(A: mat33, C: mat33):
+        return wp.max(real(1e-12), round_off * wp.sqrt(wp.ddot(A, A)) * wp.sqrt(wp.ddot(C, C)))
 
     @wp.func(name=f"log_det_{real.__name__}")
     def log_det(X: mat33):
         change = volume_change_(X)
-        if wp.abs(change) < real(0.5):
+        if wp.ddot(X, X) < real(0.1):
             return log1p_(change)
-        det = wp.determinant(wp.identity(n=3, dtype=real) + X)
+        A = wp.identity(n=3, dtype=real) + X
+        det = wp.determinant(A)
+        floor = least(A, cofactor_(A))
         above = wp.max(det, floor)
         return wp.log(above) + (det - above) / floor
 
     @wp.func_grad(log_det)
     def adj_log_det(X: mat33, adj_ret: real):
         A = wp.identity(n=3, dtype=real) + X
-        wp.adjoint[X] += adj_ret / wp.max(wp.determinant(A), floor) * cofactor_(A)
+        C = cofactor_(A)
+        wp.adjoint[X] += adj_ret / wp.max(wp.determinant(A), least(A, C)) * C
 
     return log_det
 

@@ -18,6 +18,7 @@ from physics3d.mpm.boundaries.impulse import Impulse
 from physics3d.mpm.boundaries.moving_cuboid import MovingCuboid
 from physics3d.mpm.boundaries.sequential_release import SequentialRelease
 from physics3d.mpm.materials.base import AbstractMaterial
+from physics3d.mpm.materials.mixture import Mixture
 from physics3d.mpm.materials.neo_hookean import NeoHookean
 from physics3d.mpm.world import World
 
@@ -60,7 +61,8 @@ def found(package, kind: type) -> list[type]:
 
 
 def every_material() -> list[AbstractMaterial]:
-    return [kind() for kind in found(materials, AbstractMaterial)]
+    """One default instance of each class in the folder; a mixture is nothing by itself."""
+    return [kind() for kind in found(materials, AbstractMaterial) if kind is not Mixture]
 
 
 # for a block of 3 x 3 x 3 cells of 0.1 m with its corner at the origin

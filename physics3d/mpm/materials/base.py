@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import torch
 import warp as wp
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from physics3d.mpm import spectral
@@ -38,6 +38,13 @@ class AbstractMaterial(abc.ABC):
     def memory_rows(self) -> int:
         """Internal variables per particle."""
         return 0
+
+    def per_part(self, values: Values, part: Int[Tensor, " n"], parts: tuple[str, ...]) -> Values:
+        """`values` with what the material has to know of the body: nothing, if all parts have the same.
+
+        `part` [n] are indices of the names `parts`. Raises ValueError if a part has no material, or no part a name.
+        """
+        return values
 
     @abc.abstractmethod
     def check_parameters(self, values: Values) -> None:
@@ -165,3 +172,8 @@ def lame(youngs_modulus: Tensor, poissons_ratio: Tensor) -> tuple[Tensor, Tensor
 def rows(*values: Tensor) -> Float[Tensor, "k n"]:
     """Stack scalars and per-particle values as rows of one matrix."""
     return torch.stack(torch.broadcast_tensors(*(torch.atleast_1d(torch.as_tensor(value)) for value in values)))
+
+
+def coefficient_rows(material: AbstractMaterial) -> int:
+    """The number of rows of its coefficients."""
+    return len(material.coefficients({name: torch.tensor(value) for name, value in material.example.items()}))

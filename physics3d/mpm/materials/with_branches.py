@@ -10,7 +10,6 @@ import functools
 from dataclasses import dataclass, field
 from typing import Literal
 
-import torch
 import warp as wp
 from jaxtyping import Float
 from torch import Tensor
@@ -72,6 +71,9 @@ class WithBranches(base.AbstractMaterial):
         solid, maxwell = self._split(coefficients)
         return self.solid.wave_modulus(solid) + self._maxwell.wave_modulus(maxwell)
 
+    def stiffening(self, coefficients: Float[Tensor, "k n"], memory: Float[Tensor, "m n"]) -> Float[Tensor, " n"]:
+        return self.solid.stiffening(self._split(coefficients)[0], memory[: self.solid.memory_rows])
+
     def viscosity(self, coefficients: Float[Tensor, "k n"], L: Float[Tensor, "n 3 3"]) -> Float[Tensor, " n"]:
         return self.solid.viscosity(self._split(coefficients)[0], L)
 
@@ -81,9 +83,6 @@ class WithBranches(base.AbstractMaterial):
         solid, maxwell = self._split(coefficients)
         rows = self.solid.memory_rows
         return self.solid.energy(solid, H, memory[:rows]) + self._maxwell.energy(maxwell, H, memory[rows:])
-
-    def initial_memory(self, n: int, dtype: torch.dtype) -> Float[Tensor, "m n"]:
-        return torch.cat([self.solid.initial_memory(n, dtype), self._maxwell.initial_memory(n, dtype)])
 
     def _split(self, coefficients: Float[Tensor, "k n"]) -> tuple[Float[Tensor, "a n"], Float[Tensor, "b n"]]:
         first = len(coefficients) - 4 * self.branches
