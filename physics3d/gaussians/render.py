@@ -1,5 +1,7 @@
 """Gaussians and a camera -> a picture."""
 
+from collections.abc import Callable
+
 from jaxtyping import Float
 from torch import Tensor
 
@@ -10,8 +12,19 @@ from physics3d.gaussians.sh import sh_color
 
 
 def render(
-    gaussians: Gaussians, camera: Camera, *, background: Float[Tensor, " 3"] | tuple[float, float, float]
+    gaussians: Gaussians,
+    camera: Camera,
+    *,
+    background: Float[Tensor, " 3"] | tuple[float, float, float],
+    antialiased: bool = False,
+    median: bool = False,
+    draw: Callable[..., Rendered] = rasterize,
 ) -> Rendered:
-    """Draw the model as it is; differentiable in all its fields. Raises ValueError on non-finite numbers."""
+    """Draw the model as it is; differentiable in all its fields, the background and the camera's pose.
+
+    `draw` is `rasterize`, `twin.rasterize_plainly` or `with_gsplat.rasterize_with_gsplat`; `median` asks for the median
+    depth. Raises ValueError on non-finite numbers.
+    """
     color = sh_color(gaussians.sh, gaussians.mean - camera.centre.to(gaussians.mean))
-    return rasterize(gaussians.mean, gaussians.covariance(), gaussians.opacity, color, camera, background=background)
+    arrays = (gaussians.mean, gaussians.covariance(), gaussians.opacity, color)
+    return draw(*arrays, camera, background=background, antialiased=antialiased, median=median)

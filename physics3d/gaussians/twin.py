@@ -8,7 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from physics3d.gaussians.cameras import Camera
-from physics3d.gaussians.rasterize import ALPHA_MAX, ALPHA_MIN, LOW_PASS, MARGIN, NEAR, STOP, Rendered
+from physics3d.gaussians.rasterize import STANDARD, Rendered
+from physics3d.gaussians.splatting import ALPHA_MAX, LOW_PASS, MARGIN, NEAR, Numerics
 
 
 def rasterize_plainly(
@@ -19,12 +20,15 @@ def rasterize_plainly(
     camera: Camera,
     *,
     background: Float[Tensor, " 3"],
+    antialiased: bool = False,
+    median: bool = False,
+    numerics: Numerics = STANDARD,
 ) -> Rendered:
     """Same arguments and result as `rasterize`, differentiated by torch in the precision of `mean`."""
     M = camera.world_to_camera.to(mean)
     X = mean @ M[:3, :3].T + M[:3, 3]
     order = torch.argsort(X[:, 2], stable=True)
-    order = order[(X[order, 2] > NEAR) & (opacity[order] >= ALPHA_MIN)]
+    order = order[(X[order, 2] > NEAR) & (opacity[order] >= numerics.cutoff)]
     X, covariance, opacity, color = X[order], covariance[order], opacity[order], color[order]
 
     x, y, z = X[:, 0] / X[:, 2], X[:, 1] / X[:, 2], X[:, 2]
@@ -34,21 +38,26 @@ def rasterize_plainly(
     zero, one = torch.zeros_like(z), torch.ones_like(z)
     J = torch.stack([camera.fx * torch.stack([one, zero, -xj], -1), camera.fy * torch.stack([zero, one, -yj], -1)], 1)
     J = J / z[:, None, None] @ M[:3, :3]
-    flat = J @ covariance @ J.mT + LOW_PASS * torch.eye(2).to(mean)
-    conic = torch.linalg.inv((flat + flat.mT) / 2)
+    flat = J @ covariance @ J.mT
+    flat = (flat + flat.mT) / 2
+    wide = flat + LOW_PASS * torch.eye(2).to(mean)
+    if antialiased:
+        ratio = torch.linalg.det(flat) / torch.linalg.det(wide)
+        opacity = opacity * torch.where(ratio > 0, ratio, 1).sqrt() * (ratio > 0)
 
     row, column = torch.meshgrid(torch.arange(h).to(mean) + 0.5, torch.arange(w).to(mean) + 0.5, indexing="ij")
     d = torch.stack(
         [column - (camera.fx * x + camera.cx)[:, None, None], row - (camera.fy * y + camera.cy)[:, None, None]], -1
     )
-    e = 0.5 * torch.einsum("nhwi,nij,nhwj->nhw", d, conic, d)
+    e = 0.5 * torch.einsum("nhwi,nij,nhwj->nhw", d, torch.linalg.inv(wide), d)
     alpha = (opacity[:, None, None] * torch.exp(-e)).clamp(max=ALPHA_MAX)
-    alpha = torch.where(alpha >= ALPHA_MIN, alpha, 0)
+    alpha = torch.where(alpha >= numerics.cutoff, alpha, 0)
     clear = torch.cumprod(torch.cat([torch.ones(1, h, w).to(mean), 1 - alpha]), 0)
-    drawn = clear[:-1] >= STOP
+    drawn = clear[:-1] >= numerics.stop
     weight = torch.where(drawn, clear[:-1] * alpha, 0)
     end = torch.where(drawn, 1 - alpha, 1).prod(0)
     seen = weight.sum(0) > 0
     depth = torch.where(seen, torch.einsum("nhw,n->hw", weight, z) / torch.where(seen, 1 - end, 1), 0)
+    middle = torch.einsum("nhw,n->hw", ((clear[:-1] >= 0.5) & (clear[1:] < 0.5)).to(z), z) if median else None
     picture = torch.einsum("nhw,nc->hwc", weight, color) + end[..., None] * background.to(mean)
-    return Rendered(color=picture, alpha=1 - end, depth=depth)
+    return Rendered(color=picture, alpha=1 - end, depth=depth, median=middle)

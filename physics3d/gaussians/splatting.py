@@ -1,0 +1,641 @@
+"""The kernels of `rasterize.py`: projection, tile lists, blending, and their adjoints, written by hand.
+
+A projected Gaussian is ten numbers: centre u, v [px] and depth z [m]; A, s, p of its quadratic form
+
+    e(dx, dy) = 1/2 (A (dx - s dy)^2 + p dy^2),    A = S_vv / det S,   s = S_uv / S_vv,   p = 1 / S_vv
+
+(S is its covariance in the picture; a sum of squares, so that needles lose no digits to cancellation, and the rows and
+columns it touches follow at once); its opacity; its colour. A thread owns a square of pixels and walks the list of its
+tile from near to far: Gaussians outside, rows inside, and in the innermost loop the pixels of one row as a Warp vector,
+which a CPU's compiler turns into wide instructions. On a CPU the square is the tile, on CUDA one pixel (vectors of
+length one).
+"""
+
+# mypy: ignore-errors (to a type checker, Warp kernels are another language)
+# ruff: noqa: UP018, RUF046, SIM102 (in a kernel a literal is a constant, int(0) a variable; `and` evaluates both sides)
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+NEAR = 0.01  # nothing closer to the camera is drawn [m]
+LOW_PASS = 0.3  # variance added to every splat, about one pixel wide [px^2]
+ALPHA_MAX = 0.999
+MARGIN = 0.15  # of the image's size, outside of which the Jacobian is held constant, as 3DGS does
+ENTRIES = 10  # u, v, z, A, s, p, opacity, r, g, b
+LOOK = 8  # Gaussians between two looks at whether a tile still lets light through
+
+
+@dataclass(frozen=True, kw_only=True)
+class Numerics:
+    """What a picture's error depends on, besides the Gaussians."""
+
+    precision: str = "float32"  # or float64
+    cutoff: float = 1 / 255  # alpha below which a Gaussian is not drawn
+    stop: float = 1e-4  # transmittance below which nothing behind is drawn
+    tile: int = 16  # side of a tile [px]; changes the speed, not the picture
+
+
+@dataclass(frozen=True)
+class Kernels:
+    View: Any  # struct: camera and options
+    entry: Any  # vector of a projected Gaussian
+    project: wp.Kernel
+    project_adjoint: wp.Kernel
+    list_tiles: wp.Kernel
+    blend: wp.Kernel
+    blend_adjoint: wp.Kernel
+
+
+@cache
+def kernels(numerics: Numerics, side: int) -> Kernels:
+    """Kernels for squares of side x side pixels; compiled at their first launch."""
+    real = wp.float64 if numerics.precision == "float64" else wp.float32
+    project, project_adjoint, list_tiles, View = _projection(real, numerics.tile, numerics.cutoff)
+    blend, blend_adjoint, _ = _blending(real, side, numerics)
+    return Kernels(View, _entry(real), project, project_adjoint, list_tiles, blend, blend_adjoint)
+
+
+@cache
+def median_kernel(numerics: Numerics, side: int) -> wp.Kernel:
+    return _blending(wp.float64 if numerics.precision == "float64" else wp.float32, side, numerics)[2]
+
+
+@cache
+def _entry(real):
+    return wp.types.vector(ENTRIES, real)
+
+
+@cache
+def _view(real):
+    mat33, vec3 = wp.types.matrix((3, 3), real), wp.types.vector(3, real)
+
+    @wp.struct
+    class View:
+        R: mat33  # world to camera
+        t: vec3  # [m]
+        fx: real  # [px]
+        fy: real
+        cx: real
+        cy: real
+        width: int  # [px]
+        height: int
+        antialiased: int  # 1: opacity times sqrt(det / det with the low pass)
+
+    return View
+
+
+@cache
+def _projection(real, tile: int, cutoff: float):
+    vec3, mat33, entry, View = wp.types.vector(3, real), wp.types.matrix((3, 3), real), _entry(real), _view(real)
+    TILE, CUTOFF, PASS, CLOSE, SIDEWAYS = tile, real(cutoff), real(LOW_PASS), real(NEAR), real(MARGIN)
+    zero, one, two, half = real(0.0), real(1.0), real(2.0), real(0.5)
+
+    @wp.func
+    def held(x: real, f: real, c: real, size: int) -> real:
+        """The ray's slope, held constant outside the picture."""
+        n = real(size)
+        return wp.clamp(x, (-SIDEWAYS * n - c) / f, ((one + SIDEWAYS) * n - c) / f)
+
+    @wp.func
+    def tile_rows(s: entry, height: int) -> wp.vec2i:
+        """First row of tiles that the ellipse alpha = cutoff touches, and one past the last."""
+        reach = wp.sqrt(two * wp.log(s[6] / CUTOFF) / s[5]) / real(TILE)
+        n = real((height + TILE - 1) // TILE)
+        v = s[1] / real(TILE)
+        return wp.vec2i(int(wp.clamp(wp.floor(v - reach), zero, n)), int(wp.clamp(wp.floor(v + reach) + one, zero, n)))
+
+    @wp.func
+    def tile_columns(s: entry, row: int, width: int) -> wp.vec2i:
+        """The same for the tiles of one row: where the ellipse, inside that band of pixels, is widest."""
+        limit = two * wp.log(s[6] / CUTOFF)
+        d0 = real(row * TILE) - s[1]
+        d1 = d0 + real(TILE)
+        # the ellipse is widest to the right at dy = top, to the left at dy = -top
+        slope = s[3] * s[4]  # A s;  Sigma'_uu = 1/A + s^2/p
+        top = slope / s[5] * wp.sqrt(limit / (s[3] + slope * slope / s[5]))
+        right = wp.clamp(top, d0, d1)
+        left = wp.clamp(-top, d0, d1)
+        far = s[0] + s[4] * right + wp.sqrt(wp.max(limit - s[5] * right * right, zero) / s[3])
+        near = s[0] + s[4] * left - wp.sqrt(wp.max(limit - s[5] * left * left, zero) / s[3])
+        n = real((width + TILE - 1) // TILE)
+        # a little wider, so that rounding loses no pixel
+        return wp.vec2i(
+            int(wp.clamp(wp.floor((near - real(0.01)) / real(TILE)), zero, n)),
+            int(wp.clamp(wp.floor((far + real(0.01)) / real(TILE)) + one, zero, n)),
+        )
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def project(
+        # in
+        begin: int,  # first Gaussian of this launch
+        mean: wp.array(dtype=vec3),  # [m]
+        covariance: wp.array(dtype=mat33),  # [m^2]
+        opacity: wp.array(dtype=real),
+        color: wp.array(dtype=vec3),
+        view: View,
+        # out
+        splat: wp.array(dtype=entry),  # opacity 0 where invisible
+        depth: wp.array(dtype=wp.float32),  # [m], to sort by
+        index: wp.array(dtype=int),  # 0, 1, 2, ...
+        count: wp.array(dtype=int),  # number of tiles touched
+    ):
+        i = begin + wp.tid()
+        X = view.R @ mean[i] + view.t
+        depth[i] = wp.float32(X[2])
+        index[i] = i
+        touched = int(0)
+        out = entry()
+        if X[2] > CLOSE and opacity[i] >= CUTOFF:
+            x = X[0] / X[2]
+            y = X[1] / X[2]
+            ju = (view.fx / X[2]) * vec3(one, zero, -held(x, view.fx, view.cx, view.width))
+            jv = (view.fy / X[2]) * vec3(zero, one, -held(y, view.fy, view.cy, view.height))
+            ru = ju @ view.R
+            rv = jv @ view.R
+            S = half * (covariance[i] + wp.transpose(covariance[i]))
+            sv = S @ rv
+            a = wp.dot(ru, S @ ru)
+            b = wp.dot(ru, sv)
+            c = wp.dot(rv, sv)
+            # det(Sigma' + s I) = det Sigma' + s tr Sigma' + s^2, which rounding cannot make negative
+            bare = wp.max(a * c - b * b, zero)
+            det = bare + PASS * (a + c) + PASS * PASS
+            o = opacity[i]
+            if view.antialiased == 1:
+                o = o * wp.sqrt(bare / det)
+            if o >= CUTOFF:
+                q = color[i]
+                out = entry(
+                    view.fx * x + view.cx, view.fy * y + view.cy, X[2],
+                    (c + PASS) / det, b / (c + PASS), one / (c + PASS), o, q[0], q[1], q[2],
+                )  # fmt: skip
+                rows = tile_rows(out, view.height)
+                for row in range(rows[0], rows[1]):
+                    columns = tile_columns(out, row, view.width)
+                    touched += wp.max(columns[1] - columns[0], 0)
+        splat[i] = out
+        count[i] = touched
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def list_tiles(
+        # in
+        begin: int,
+        order: wp.array(dtype=int),  # Gaussians from near to far
+        last: wp.array(dtype=int),  # running sum of the tile counts in that order
+        count: wp.array(dtype=int),
+        splat: wp.array(dtype=entry),
+        width: int,
+        height: int,
+        # out
+        tile: wp.array(dtype=int),  # of every pair (tile, Gaussian)
+        gaussian: wp.array(dtype=int),
+    ):
+        i = begin + wp.tid()
+        g = order[i]
+        if count[g] > 0:
+            k = last[i] - count[g]
+            s = splat[g]
+            rows = tile_rows(s, height)
+            for row in range(rows[0], rows[1]):
+                columns = tile_columns(s, row, width)
+                for column in range(columns[0], columns[1]):
+                    tile[k] = row * ((width + TILE - 1) // TILE) + column
+                    gaussian[k] = g
+                    k += 1
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def project_adjoint(
+        # in
+        begin: int,
+        mean: wp.array(dtype=vec3),
+        covariance: wp.array(dtype=mat33),
+        opacity: wp.array(dtype=real),
+        count: wp.array(dtype=int),
+        view: View,
+        sums: wp.array2d(dtype=entry),  # [part, n] adjoint of `splat`
+        # out
+        mean_bar: wp.array(dtype=vec3),
+        covariance_bar: wp.array(dtype=mat33),
+        opacity_bar: wp.array(dtype=real),
+        color_bar: wp.array(dtype=vec3),
+    ):
+        i = begin + wp.tid()
+        X_bar = vec3()
+        S_bar = mat33()
+        o_bar = zero
+        q_bar = vec3()
+        if count[i] > 0:
+            bar = entry()
+            for part in range(sums.shape[0]):
+                bar += sums[part, i]
+            q_bar = vec3(bar[7], bar[8], bar[9])
+            X = view.R @ mean[i] + view.t
+            x = X[0] / X[2]
+            y = X[1] / X[2]
+            xj = held(x, view.fx, view.cx, view.width)
+            yj = held(y, view.fy, view.cy, view.height)
+            fu = view.fx / X[2]
+            fv = view.fy / X[2]
+            ru = fu * vec3(one, zero, -xj) @ view.R
+            rv = fv * vec3(zero, one, -yj) @ view.R
+            S = half * (covariance[i] + wp.transpose(covariance[i]))
+            su = S @ ru
+            sv = S @ rv
+            a = wp.dot(ru, su)
+            b = wp.dot(ru, sv)
+            c = wp.dot(rv, sv)
+            bare = wp.max(a * c - b * b, zero)
+            det = bare + PASS * (a + c) + PASS * PASS
+            p = one / (c + PASS)
+            s = b * p
+            # A = (c + PASS) / det, s = b p, p = 1 / (c + PASS)
+            c_bar = bar[3] / det - (bar[4] * s + bar[5] * p) * p
+            b_bar = bar[4] * p
+            det_bar = -bar[3] / (p * det * det)
+            bare_bar = zero
+            o_bar = bar[6]
+            if view.antialiased == 1:
+                rho = wp.sqrt(bare / det)
+                o_bar = bar[6] * rho
+                ratio_bar = bar[6] * opacity[i] / (two * rho)
+                bare_bar = ratio_bar / det
+                det_bar -= ratio_bar * bare / (det * det)
+            # det = bare + PASS (a + c) + PASS^2, bare = a c - b^2
+            bare_bar += det_bar
+            a_bar = det_bar * PASS + bare_bar * c
+            c_bar += det_bar * PASS + bare_bar * a
+            b_bar -= two * b * bare_bar
+            cross = half * b_bar * wp.outer(ru, rv)
+            S_bar = a_bar * wp.outer(ru, ru) + c_bar * wp.outer(rv, rv) + cross + wp.transpose(cross)
+            ju_bar = view.R @ (two * a_bar * su + b_bar * sv)
+            jv_bar = view.R @ (two * c_bar * sv + b_bar * su)
+            x_bar = bar[0] * view.fx
+            y_bar = bar[1] * view.fy
+            if x == xj:
+                x_bar -= fu * ju_bar[2]
+            if y == yj:
+                y_bar -= fv * jv_bar[2]
+            shrink = fu * (ju_bar[0] - xj * ju_bar[2]) + fv * (jv_bar[1] - yj * jv_bar[2]) + x_bar * x + y_bar * y
+            X_bar = vec3(x_bar / X[2], y_bar / X[2], bar[2] - shrink / X[2])
+        mean_bar[i] = X_bar @ view.R
+        covariance_bar[i] = S_bar
+        opacity_bar[i] = o_bar
+        color_bar[i] = q_bar
+
+    return project, project_adjoint, list_tiles, View
+
+
+@cache
+def _blending(real, side: int, numerics: Numerics):
+    entry, row = _entry(real), wp.types.vector(side, real)
+    integers = wp.types.vector(side, wp.int32)
+    SIDE, TILE, MOST = side, numerics.tile, real(ALPHA_MAX)
+    CUTOFF, STOP = real(numerics.cutoff), real(numerics.stop)
+    zero, half, one, two = real(0.0), real(0.5), real(1.0), real(2.0)
+    # loops over pixels stay loops, which the compiler turns into wide instructions
+    options = {
+        "max_unroll": 1,
+        "cpu_compiler_flags": "-march=native -mprefer-vector-width=512 -mllvm=-inline-threshold=9000",
+    }
+
+    if real is wp.float32:
+        # 2^t = 2^n 2^f with |f| <= 1/2 by its series, error 1e-7: a call to exp could not be made wide
+        L, K = wp.float32(-1.4426950408889634), wp.float32(-120.0)
+        a1, a2, a3 = wp.float32(0.6931471805599453), wp.float32(0.2402265069591007), wp.float32(0.05550410866482158)
+        a4, a5, a6 = (
+            wp.float32(0.009618129107628477),
+            wp.float32(0.0013333558146428443),
+            wp.float32(0.00015403530393381608),
+        )
+
+        @wp.func
+        def decay(e: real) -> real:
+            """exp(-e) for e >= 0."""
+            t = wp.max(L * e, K)
+            n = int(t - half)
+            f = t - real(n)
+            series = one + f * (a1 + f * (a2 + f * (a3 + f * (a4 + f * (a5 + f * a6)))))
+            return series * wp.cast((n + 127) << 23, wp.float32)
+
+    else:
+
+        @wp.func
+        def decay(e: real) -> real:
+            return wp.exp(-e)
+
+    @wp.func
+    def square(i: int, width: int) -> wp.vec3i:
+        """Left and top pixel of the i-th square of pixels, and the tile it lies in."""
+        per_side = TILE // SIDE
+        tiles_x = (width + TILE - 1) // TILE
+        tile = i // (per_side * per_side)
+        s = i % (per_side * per_side)
+        return wp.vec3i(
+            (tile % tiles_x) * TILE + (s % per_side) * SIDE, (tile // tiles_x) * TILE + (s // per_side) * SIDE, tile
+        )
+
+    @wp.func
+    def rows(s: entry, y0: int, y1: int) -> wp.vec2i:
+        """Rows of pixels, of y0..y1, that the ellipse alpha = cutoff touches."""
+        reach = wp.sqrt(two * wp.log(s[6] / CUTOFF) / s[5])
+        first = wp.clamp(wp.ceil(s[1] - reach - half), real(y0), real(y1))
+        last = wp.clamp(wp.floor(s[1] + reach - half) + one, real(y0), real(y1))
+        return wp.vec2i(int(first), int(last))
+
+    @wp.func
+    def light(T: row) -> int:
+        """1 if any pixel of the row still lets light through."""
+        most = zero
+        for x in range(SIDE):
+            most = wp.max(most, T[x])
+        return wp.where(most >= STOP, 1, 0)
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=options)
+    def blend(
+        # in
+        begin: int,  # first square of this launch
+        start: wp.array(dtype=int),  # first pair of every tile, and one past the last
+        gaussian: wp.array(dtype=int),
+        splat: wp.array(dtype=entry),
+        background: wp.array(dtype=real),  # [3]
+        width: int,
+        height: int,
+        # out
+        color: wp.array3d(dtype=real),  # [h, w, 3]
+        alpha: wp.array2d(dtype=real),
+        depth: wp.array2d(dtype=real),  # [m]
+        clear: wp.array2d(dtype=real),  # transmittance
+    ):
+        corner = square(begin + wp.tid(), width)
+        x0 = corner[0]
+        y0 = corner[1]
+        if x0 >= width or y0 >= height:
+            return
+        y1 = wp.min(y0 + SIDE, height)
+        nx = wp.min(SIDE, width - x0)
+        rays = wp.zeros(shape=(5, SIDE), dtype=row)  # transmittance, sum w r, w g, w b, w z
+        for y in range(y1 - y0):
+            T = row()
+            for x in range(nx):
+                T[x] = one
+            rays[0, y] = T
+        k = start[corner[2]]
+        end = start[corner[2] + 1]
+        open = int(1)
+        while k < end and open == 1:
+            s = splat[gaussian[k]]
+            k += 1
+            u = s[0] - real(x0) - half
+            span = rows(s, y0, y1)
+            for y in range(span[0], span[1]):
+                dy = real(y) + half - s[1]
+                mid = u + s[4] * dy
+                e0 = half * s[5] * dy * dy
+                e2 = half * s[3]
+                T = rays[0, y - y0]
+                r = rays[1, y - y0]
+                g = rays[2, y - y0]
+                b = rays[3, y - y0]
+                z = rays[4, y - y0]
+                for x in range(SIDE):
+                    dx = real(x) - mid
+                    a = wp.min(s[6] * decay(e2 * dx * dx + e0), MOST)
+                    t = T[x]
+                    w = t * a
+                    w = wp.where(a >= CUTOFF, w, zero)
+                    w = wp.where(t >= STOP, w, zero)
+                    T[x] = t - w
+                    r[x] = r[x] + w * s[7]
+                    g[x] = g[x] + w * s[8]
+                    b[x] = b[x] + w * s[9]
+                    z[x] = z[x] + w * s[2]
+                rays[0, y - y0] = T
+                rays[1, y - y0] = r
+                rays[2, y - y0] = g
+                rays[3, y - y0] = b
+                rays[4, y - y0] = z
+            if k % wp.static(LOOK) == 0:
+                open = int(0)
+                for y in range(y1 - y0):
+                    open = wp.max(open, light(rays[0, y]))
+        for y in range(y1 - y0):
+            T = rays[0, y]
+            r = rays[1, y]
+            g = rays[2, y]
+            b = rays[3, y]
+            z = rays[4, y]
+            for x in range(nx):
+                t = T[x]
+                color[y0 + y, x0 + x, 0] = r[x] + t * background[0]
+                color[y0 + y, x0 + x, 1] = g[x] + t * background[1]
+                color[y0 + y, x0 + x, 2] = b[x] + t * background[2]
+                alpha[y0 + y, x0 + x] = one - t
+                depth[y0 + y, x0 + x] = wp.where(t < one, z[x] / wp.max(one - t, real(1e-9)), zero)
+                clear[y0 + y, x0 + x] = t
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=options)
+    def blend_adjoint(
+        # in
+        begin: int,
+        part: int,  # which private block of sums this launch adds to
+        start: wp.array(dtype=int),
+        gaussian: wp.array(dtype=int),
+        splat: wp.array(dtype=entry),
+        width: int,
+        height: int,
+        color: wp.array3d(dtype=real),
+        alpha: wp.array2d(dtype=real),
+        depth: wp.array2d(dtype=real),
+        clear: wp.array2d(dtype=real),
+        color_bar: wp.array3d(dtype=real),  # adjoints; empty ones are zero
+        alpha_bar: wp.array2d(dtype=real),
+        depth_bar: wp.array2d(dtype=real),
+        # out
+        sums: wp.array2d(dtype=entry),  # [part, n] adjoint of `splat`, added to
+    ):
+        corner = square(begin + wp.tid(), width)
+        x0 = corner[0]
+        y0 = corner[1]
+        if x0 >= width or y0 >= height:
+            return
+        y1 = wp.min(y0 + SIDE, height)
+        nx = wp.min(SIDE, width - x0)
+        # transmittance; what lies behind: sum of w (adjoint of the pixel . colour and depth); adjoints of the four sums
+        rays = wp.zeros(shape=(6, SIDE), dtype=row)
+        for y in range(y1 - y0):
+            T = row()
+            rest = row()
+            r = row()
+            g = row()
+            b = row()
+            z = row()
+            for x in range(nx):
+                T[x] = one
+                i = y0 + y
+                j = x0 + x
+                if color_bar.shape[0] > 0:
+                    r[x] = color_bar[i, j, 0]
+                    g[x] = color_bar[i, j, 1]
+                    b[x] = color_bar[i, j, 2]
+                    rest[x] = r[x] * color[i, j, 0] + g[x] * color[i, j, 1] + b[x] * color[i, j, 2]
+                if alpha_bar.shape[0] > 0:
+                    rest[x] = rest[x] - alpha_bar[i, j] * clear[i, j]
+                if depth_bar.shape[0] > 0:
+                    if alpha[i, j] > zero:
+                        z[x] = depth_bar[i, j] / alpha[i, j]
+                        rest[x] = rest[x] + z[x] * depth[i, j]
+            rays[0, y] = T
+            rays[1, y] = rest
+            rays[2, y] = r
+            rays[3, y] = g
+            rays[4, y] = b
+            rays[5, y] = z
+        k = start[corner[2]]
+        end = start[corner[2] + 1]
+        open = int(1)
+        while k < end and open == 1:
+            i = gaussian[k]
+            s = splat[i]
+            k += 1
+            u = s[0] - real(x0) - half
+            span = rows(s, y0, y1)
+            # sums over pixels, of e_bar, the adjoint of the exponent, its moments, and of w times the pixels' adjoints
+            m0 = row()
+            m1 = row()
+            m2 = row()
+            my = row()
+            mxy = row()
+            myy = row()
+            cr = row()
+            cg = row()
+            cb = row()
+            cz = row()
+            for y in range(span[0], span[1]):
+                dy = real(y) + half - s[1]
+                mid = u + s[4] * dy
+                e0 = half * s[5] * dy * dy
+                e2 = half * s[3]
+                T = rays[0, y - y0]
+                rest = rays[1, y - y0]
+                r = rays[2, y - y0]
+                g = rays[3, y - y0]
+                b = rays[4, y - y0]
+                z = rays[5, y - y0]
+                for x in range(SIDE):
+                    dx = real(x) - mid
+                    a = wp.min(s[6] * decay(e2 * dx * dx + e0), MOST)
+                    t = T[x]
+                    a = wp.where(a >= CUTOFF, a, zero)
+                    a = wp.where(t >= STOP, a, zero)
+                    w = t * a
+                    T[x] = t - w
+                    value = r[x] * s[7] + g[x] * s[8] + b[x] * s[9] + z[x] * s[2]
+                    behind = rest[x] - w * value
+                    rest[x] = behind
+                    cr[x] = cr[x] + w * r[x]
+                    cg[x] = cg[x] + w * g[x]
+                    cb[x] = cb[x] + w * b[x]
+                    cz[x] = cz[x] + w * z[x]
+                    e_bar = a * behind / (one - a) - w * value
+                    e_bar = wp.where(a < MOST, e_bar, zero)
+                    ex = e_bar * dx
+                    m0[x] = m0[x] + e_bar
+                    m1[x] = m1[x] + ex
+                    m2[x] = m2[x] + ex * dx
+                    my[x] = my[x] + e_bar * dy
+                    mxy[x] = mxy[x] + ex * dy
+                    myy[x] = myy[x] + e_bar * dy * dy
+                rays[0, y - y0] = T
+                rays[1, y - y0] = rest
+            if span[0] < span[1]:
+                bar = entry()
+                tx = zero
+                ty = zero
+                txy = zero
+                for x in range(SIDE):
+                    tx += m1[x]
+                    ty += my[x]
+                    txy += mxy[x]
+                    bar[2] = bar[2] + cz[x]
+                    bar[3] = bar[3] + half * m2[x]
+                    bar[5] = bar[5] + half * myy[x]
+                    bar[6] = bar[6] - m0[x]
+                    bar[7] = bar[7] + cr[x]
+                    bar[8] = bar[8] + cg[x]
+                    bar[9] = bar[9] + cb[x]
+                bar[0] = -s[3] * tx
+                bar[1] = s[3] * s[4] * tx - s[5] * ty
+                bar[4] = -s[3] * txy
+                bar[6] = bar[6] / s[6]
+                wp.atomic_add(sums, part, i, bar)
+            if k % wp.static(LOOK) == 0:
+                open = int(0)
+                for y in range(y1 - y0):
+                    open = wp.max(open, light(rays[0, y]))
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=options)
+    def median_kernel(
+        # in
+        begin: int,
+        start: wp.array(dtype=int),
+        gaussian: wp.array(dtype=int),
+        splat: wp.array(dtype=entry),
+        width: int,
+        height: int,
+        # out
+        middle: wp.array2d(dtype=int),  # Gaussian at which the transmittance falls below one half; -1 where it does not
+    ):
+        corner = square(begin + wp.tid(), width)
+        x0 = corner[0]
+        y0 = corner[1]
+        if x0 >= width or y0 >= height:
+            return
+        y1 = wp.min(y0 + SIDE, height)
+        nx = wp.min(SIDE, width - x0)
+        clear = wp.zeros(shape=(SIDE,), dtype=row)
+        found = wp.zeros(shape=(SIDE,), dtype=integers)
+        for y in range(y1 - y0):
+            T = row()
+            for x in range(nx):
+                T[x] = one
+            clear[y] = T
+            found[y] = integers(-1)
+        k = start[corner[2]]
+        end = start[corner[2] + 1]
+        open = int(1)
+        while k < end and open == 1:
+            i = gaussian[k]
+            s = splat[i]
+            k += 1
+            u = s[0] - real(x0) - half
+            span = rows(s, y0, y1)
+            for y in range(span[0], span[1]):
+                dy = real(y) + half - s[1]
+                mid = u + s[4] * dy
+                e0 = half * s[5] * dy * dy
+                e2 = half * s[3]
+                T = clear[y - y0]
+                at = found[y - y0]
+                for x in range(SIDE):
+                    dx = real(x) - mid
+                    a = wp.min(s[6] * decay(e2 * dx * dx + e0), MOST)
+                    t = T[x]
+                    w = t * wp.where(a >= CUTOFF, a, zero)
+                    w = wp.where(t >= STOP, w, zero)
+                    T[x] = t - w
+                    at[x] = wp.where(t >= half and t - w < half, i, at[x])
+                clear[y - y0] = T
+                found[y - y0] = at
+            if k % wp.static(LOOK) == 0:
+                open = int(0)
+                for y in range(y1 - y0):
+                    open = wp.max(open, light(clear[y]))
+        for y in range(y1 - y0):
+            at = found[y]
+            for x in range(nx):
+                middle[y0 + y, x0 + x] = at[x]
+
+    return blend, blend_adjoint, median_kernel
