@@ -7,7 +7,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 SOURCES = sorted(p for folder in ("physics3d", "stages", "pipeline") for p in (ROOT / folder).rglob("*.py"))
-BOTTOM = ("physics3d.artifact", "physics3d.video", "physics3d.log")
+BOTTOM = ("physics3d.artifact", "physics3d.video", "physics3d.log", "physics3d.open3d_import")
 CORES = ("physics3d.gaussians", "physics3d.mpm", "physics3d.priors")
 ORCHESTRATION = ("prefect", "mlflow", "hydra", "omegaconf")
 # sam2 brings its own Hydra configuration files, which are read where its model is built

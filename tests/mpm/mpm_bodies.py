@@ -15,6 +15,7 @@ from physics3d.mpm.boundaries.fixed_region import FixedRegion
 from physics3d.mpm.boundaries.half_space import HalfSpace
 from physics3d.mpm.boundaries.held_particles import HeldParticles
 from physics3d.mpm.boundaries.impulse import Impulse
+from physics3d.mpm.boundaries.mesh_collider import MeshCollider
 from physics3d.mpm.boundaries.moving_cuboid import MovingCuboid
 from physics3d.mpm.boundaries.sequential_release import SequentialRelease
 from physics3d.mpm.materials.base import AbstractMaterial
@@ -76,6 +77,17 @@ EXAMPLES: list[AbstractBoundary] = [
     FixedRegion(lower=(-0.1, -0.1, -0.1), upper=(0.1, 0.4, 0.4)),
     HeldParticles(position=((0.05, 0.05, 0.02), (0.05, 0.22, 0.02), (0.22, 0.1, 0.04))),
     Impulse(force=(30.0, 5.0, -4.0), centre=(0.2, 0.2, 0.2), radius=0.12, start=0.013, duration=0.03),
+    MeshCollider(  # a corner of a cube that turns as it moves into the block
+        vertices=((-0.1, -0.1, -0.1), (0.25, -0.1, -0.1), (-0.1, 0.25, -0.1), (-0.1, -0.1, 0.25)),
+        triangles=((0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)),
+        rotation=(0.1, 0.0, 0.2),
+        velocity=(0.5, 0.2, 0.3),
+        angular_velocity=(0.0, 1.0, 2.0),
+        start=0.013,
+        duration=0.04,
+        kind="separate",
+        friction=0.3,
+    ),
     MovingCuboid(lower=(-0.1, -0.1, -0.1), upper=(0.1, 0.4, 0.1), velocity=(0.5, 0.0, 0.5), start=0.01, duration=0.05),
     EnforcedTranslation(lower=(0.0, 0.0, 0.0), upper=(0.1, 0.3, 0.3), velocity=(-0.3, 0.2, 0.0), duration=0.05),
     EnforcedRotation(
