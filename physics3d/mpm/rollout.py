@@ -5,9 +5,14 @@
 Time step. Waves cross a cell in dx/(c + |v|), with rho c^2 = M + 2 |tau|, M the wave modulus at rest: a bound for
 stretched and compressed bodies, where it is M - tau (Hencky), at most M + |tau| (neo-Hookean) or s^2 M at a stretch s
 (fixed corotated). A lone particle, whose stress comes back undiluted, needs dt < dx/(sqrt(3) c): its three axes act
-together (Sun, Shinar and Schroeder 2020). An automatic substep is cfl times the former and at most 0.95 times the
-latter. Every frame has a whole number of equal substeps; a frame that turns out too fast for them is done again with
-more.
+together (Sun, Shinar and Schroeder 2020). A viscosity eta without a spring in series needs dt < b = rho dx^2/(6 eta);
+beside waves that need dt < a, damping at the rate 2/b leaves dt < a [(1 + x^2)^(1/2) - x], x = a/(2 b). An automatic
+substep is cfl times the first and at most 0.95 times the last. Every frame has a whole number of equal substeps; a
+frame that turns out too fast for them is done again with more, up to world.max_substeps.
+
+The implicit scheme (`implicit.py`) knows none of these limits. Its automatic step is the whole frame, unless a particle
+moves farther than half a cell in it, or turns or stretches by more than a fifth; a frame whose equations Newton cannot
+solve is done again with twice the steps. scheme="auto" takes it where an explicit frame would be dearer.
 
 Gradients. The exact adjoint of the discrete trajectory: the state is kept at every RUN-th substep, and the reverse pass
 recomputes the substeps in between, run by run, with the same dt and the same windows.
@@ -26,6 +31,7 @@ from torch import Tensor
 from physics3d.artifact import AbstractArtifact, require_finite
 from physics3d.log import Log
 from physics3d.mpm.boundaries.base import AbstractBoundary, Setting, Vector, mirror_nodes
+from physics3d.mpm.implicit import ImplicitSubsteps, NotConverged
 from physics3d.mpm.substep import Hook, Substeps, start_warp
 from physics3d.mpm.transfer import velocity_gradient
 from physics3d.mpm.world import World
@@ -33,6 +39,7 @@ from physics3d.mpm.world import World
 RUN = 32  # substeps between two looks at the particles, and between two checkpoints
 MOST_NODES = 2**27
 TRIES = 6  # of one frame, each with twice the substeps
+WORTH = 1000  # explicit substeps that one implicit step has to save
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,10 +151,30 @@ class _Run:
     size: tuple[int, ...]
     clock: np.ndarray  # [substeps, k]
     flat: Tensor | None  # the state before, if gradients are wanted
+    node_velocity: Tensor | None = None  # the solution of an implicit step, likewise
 
 
 class _TooFast(Exception):
-    """This frame needs shorter substeps, or a wider window; the message says why."""
+    """This frame needs shorter substeps, or a wider window; `why`, and what of the scene would spare them."""
+
+    def __init__(self, why: str, remedy: str):
+        super().__init__(why)
+        self.remedy = remedy
+
+
+@dataclass(frozen=True)
+class _Limit:
+    """How long an explicit substep may be in a state."""
+
+    crossing: float  # waves and the fastest particle cross a cell [s]
+    alone: float  # a lone particle stays stable, viscosity included [s]
+    why: str
+    remedy: str
+
+    @property
+    def dt(self) -> float:
+        """The longest stable substep [s]."""
+        return min(self.crossing, self.alone)
 
 
 @dataclass
@@ -165,6 +192,9 @@ class _Solver:
     threads: int | None
     log: Log
     counts: list[int] = field(default_factory=list)  # substeps of each frame
+    work: dict[str, int] = field(default_factory=dict)  # what the present frame has cost
+    implicit: ImplicitSubsteps | None = None  # once the scheme is implicit, it stays so
+    no_implicit: str = ""  # why the automatic scheme gave it up
     health: dict[str, list[float]] = field(default_factory=dict)
 
     def forward(
@@ -187,6 +217,7 @@ class _Solver:
         u, deformation = torch.empty((self.frames, n, 3), **kind), torch.empty((self.frames, n, 3, 3), **kind)
         eye = torch.eye(3, **kind)
         for frame in self.log.progress(range(self.frames), "simulate"):
+            self.work = dict.fromkeys(("rejected", "lost", "newton", "products"), 0)
             if frame:
                 self._frame(frame, keep)
             now = substeps.state(self.current)
@@ -207,6 +238,9 @@ class _Solver:
             for run in reversed(self.runs[frame - 1]):
                 substeps.state(0).flat.copy_(run.flat)
                 substeps.set_window(run.lowest, run.size)
+                if run.node_velocity is not None:
+                    side = self.implicit.reverse(run.clock, 0, 1, side, run.node_velocity)
+                    continue
                 path = range(len(run.clock) + 1)
                 substeps.run(run.clock, path)
                 side = substeps.reverse(run.clock, path, side)
@@ -220,23 +254,71 @@ class _Solver:
     def _frame(self, frame: int, keep: bool) -> None:
         """From one frame to the next, in equal substeps that obey the limit; more of them if it turns out too fast."""
         start = self.substeps.state(self.current).flat.clone()
+        self._choose(frame)
         count, reach = self._count(frame), 2.0
-        for _ in range(TRIES if self.world.dt is None else 3):
+        fixed = self.world.dt is not None
+        tries = (1 if self.implicit else 3) if fixed else TRIES
+        for tried in range(1, tries + 1):
             try:
-                self.runs.append(self._runs(frame, count, reach, keep))
+                steps = self._steps if self.implicit else self._runs
+                self.runs.append(steps(frame, count, reach, keep))
                 self.counts.append(count)
                 return
             except _TooFast as reason:
-                why = str(reason)
+                why, remedy = str(reason), reason.remedy
                 self.substeps.state(self.current).flat.copy_(start)
+                self.work["rejected"] += 1
                 reach = min(2 * reach, 8.0)
-                if self.world.dt is None:
-                    count *= 2
-        dt = self.frame_dt / count
-        remedy = (
-            "a smaller cfl, a softer material or a weaker force" if self.world.dt is None else f"world.dt < {dt / 2:g}"
+                if tried == tries or (not fixed and 2 * count > self.world.max_substeps):
+                    break
+                count *= 1 if fixed else 2
+        if self.implicit and self.world.scheme == "auto":
+            self.implicit, self.no_implicit = None, why
+            self.log.warn(f"frame {frame}: {why}; explicit from here on")
+            return self._frame(frame, keep)
+        dt, t = self.frame_dt / count, (frame - 1) * self.frame_dt
+        if fixed:
+            remedy = f"world.dt < {dt / 2:g}, or {remedy}"
+        raise ValueError(
+            f"frame {frame}: {why} with substeps of {dt:g} s, {tried} tries from {t:g} s on; take {remedy}"
         )
-        raise ValueError(f"frame {frame}: {why} with substeps of {dt:g} s; take {remedy}")
+
+    def _choose(self, frame: int) -> None:
+        """Make the coming frame implicit if the world wants that, or lets us and it pays."""
+        if self.implicit or self.no_implicit or self.world.scheme == "explicit":
+            return
+        if self.world.scheme == "auto":
+            if self.world.dt is not None:
+                return
+            now = self.substeps.state(self.current)
+            explicit, implicit = self._explicit_need(self._limit(now)), self._implicit_need(now)
+            if explicit < WORTH * implicit:
+                return
+            self.log.info(f"frame {frame}: implicit, for the explicit scheme would need {explicit} substeps a frame")
+        self.implicit = ImplicitSubsteps(self.substeps, bounded=self.bounded)
+
+    def _steps(self, frame: int, count: int, reach: float, keep: bool) -> list[_Run]:
+        """`count` implicit steps, each a run of its own."""
+        assert self.implicit is not None
+        dt = self.frame_dt / count
+        runs = []
+        for done in range(count):
+            now = self.substeps.state(self.current)
+            # weights are those of the start: no room for motion
+            lowest, size = self._window(now, 0, dt, 0.0, frame)
+            self.substeps.set_window(lowest, size)
+            clock = self._clock((frame - 1) * self.frame_dt + done * dt, dt, 1)
+            flat = now.flat.clone() if keep else None
+            try:
+                step = self.implicit.step(clock, self.current, 1 - self.current)
+            except NotConverged as reason:
+                raise _TooFast(str(reason), "a weaker force, a slower start or scheme='explicit'") from None
+            self.current = 1 - self.current
+            self.work["newton"] += step.newton
+            self.work["products"] += step.products
+            runs.append(_Run(lowest, size, clock, flat, step.node_velocity if keep else None))
+            self._inspect(frame, dt, 0)
+        return runs
 
     def _runs(self, frame: int, count: int, reach: float, keep: bool) -> list[_Run]:
         dt = self.frame_dt / count
@@ -250,6 +332,7 @@ class _Solver:
             runs.append(_Run(lowest, size, clock, now.flat.clone() if keep else None))
             path = [(self.current + s) % 2 for s in range(steps + 1)]
             lost = self.substeps.run(clock, path)
+            self.work["lost"] += lost
             self.current = path[-1]
             self._inspect(frame, dt, lost)
         return runs
@@ -257,14 +340,24 @@ class _Solver:
     def _inspect(self, frame: int, dt: float, lost: int) -> None:
         """After a run: is every number finite, every particle in the region, and every substep short enough?"""
         now = self.substeps.state(self.current)
-        bad = int((~torch.isfinite(now.flat[: 3 * len(now.u)].view(-1, 3) + now.tau.sum((1, 2))[:, None])).any(1).sum())
-        if bad:
-            raise _TooFast(f"{bad} of {len(now.u)} particles have become infinite or NaN")
+        bad = (~torch.isfinite(now.flat[: 3 * len(now.u)].view(-1, 3) + now.tau.sum((1, 2))[:, None])).any(1)
+        if bool(bad.any()):
+            count = int(bad.sum())
+            raise _TooFast(
+                f"{count} of {len(bad)} particles have become infinite or NaN, first {self._who(bad)}", self.remedy
+            )
         if lost:
-            raise _TooFast(f"particles moved too far in a few substeps ({lost} times outside the grid)")
-        limit = self._limit(now)
-        if dt > limit:
-            raise _TooFast(f"waves and particles cross a cell in {limit:g} s")
+            raise _TooFast(
+                f"particles moved too far in a few substeps ({lost} times outside the grid)",
+                "a weaker force or a slower start",
+            )
+        limit, speed = self._limit(now), now.v.norm(dim=1)
+        if self.implicit and dt * float(speed.max()) > self.world.dx:
+            way = dt * float(speed.max()) / self.world.dx
+            who = self._who(speed == speed.max())
+            raise _TooFast(f"{who} moves {way:.3g} cells in a step", "a weaker force or a slower start")
+        if not self.implicit and dt > limit.dt:
+            raise _TooFast(limit.why, limit.remedy)
         x = self.rest + now.u
         slack = 1.5 * self.world.dx
         low, high = x.new_tensor(self.setting.lower) - slack, x.new_tensor(self.setting.upper) + slack
@@ -306,28 +399,72 @@ class _Solver:
         c = ((modulus.double() + 2 * torch.maximum(high, -low)) / self.world.density).sqrt().max()
         return float(c), float(now.v.double().norm(dim=1).max())
 
-    def _limit(self, now) -> float:
-        """The longest stable substep [s]."""
+    def _limit(self, now) -> _Limit:
+        """How long an explicit substep may be in this state."""
         c, v = self._speeds(now)
-        return min(self.world.dx / (c + v), self.world.dx / (math.sqrt(3) * c))
+        dx, density = self.world.dx, self.world.density
+        eta = float(self.world.material.viscosity(self.coefficients, now.L).max())
+        waves, viscous = dx / (math.sqrt(3) * c), density * dx**2 / (6 * eta) if eta > 0 else math.inf
+        x = waves / (2 * viscous)
+        alone = waves / (math.sqrt(1 + x**2) + x)
+        if x > 1:
+            why = f"a viscosity of {eta:.3g} Pa s lets momentum cross a cell in {viscous:g} s"
+            remedy = "a lower viscosity, a larger dx or scheme='implicit'"
+        elif v > c:
+            why, remedy = f"waves and particles cross a cell in {dx / (c + v):g} s", "a weaker force or a slower start"
+        else:
+            why = f"waves cross a cell in {dx / (c + v):g} s"
+            remedy = "a softer material, a larger dx or scheme='implicit'"
+        return _Limit(dx / (c + v), alone, why, remedy)
+
+    def _explicit_need(self, limit: _Limit) -> int:
+        """Substeps that a frame needs."""
+        return math.ceil(self.frame_dt / min(self.world.cfl * limit.crossing, 0.95 * limit.alone))
+
+    def _implicit_need(self, now) -> int:
+        """Implicit steps that a frame needs: no particle moves half a cell, turns or stretches by a fifth."""
+        gain = math.hypot(*self.world.gravity) * self.frame_dt
+        speed = (float(now.v.norm(dim=1).max()) + gain) / (0.5 * self.world.dx)
+        rate = float(now.L.flatten(1).norm(dim=1).max()) / 0.2
+        return max(1, math.ceil(self.frame_dt * max(speed, rate)))
 
     def _count(self, frame: int) -> int:
-        """Equal substeps of the coming frame. Raises ValueError where the user's dt is above the limit."""
+        """Equal substeps of the coming frame. Raises ValueError where the user's dt is above the limit, or there are
+        more of them than the world allows."""
         now = self.substeps.state(self.current)
-        c, v = self._speeds(now)
-        dx, dt = self.world.dx, self.world.dt
+        limit, dt, most = self._limit(now), self.world.dt, self.world.max_substeps
+        self.remedy = limit.remedy
+        last = self.counts[-1] if self.counts else 0
         if dt is not None:
-            limit = self._limit(now)
-            if dt > limit:
+            need = math.ceil(self.frame_dt / dt * (1 - 1e-9))
+            if dt > limit.dt and not self.implicit:
                 raise ValueError(
-                    f"substep_dt is {dt:g} s, waves cross a cell in {dx / (c + v):g} s (frame {frame}); "
-                    f"take world.dt < {limit:.3g}, or None for an automatic one"
+                    f"substep_dt is {dt:g} s, {limit.why} (frame {frame}); take world.dt < {limit.dt:.3g}, None for an "
+                    "automatic one, or scheme='implicit'"
                 )
-            return math.ceil(self.frame_dt / dt * (1 - 1e-9))
-        need = math.ceil(self.frame_dt / min(self.world.cfl * dx / (c + v), 0.95 * dx / (math.sqrt(3) * c)))
-        last = self.counts[-1] if self.counts else need
-        # a count that still serves is kept, so that dt does not flicker from frame to frame
-        return last if need <= last <= 1.5 * need else need
+        elif self.implicit:
+            # half of the last, so that a frame that had to be halved does not make the next one start from too few
+            need = max(self._implicit_need(now), last // 2)
+        else:
+            need = self._explicit_need(limit)
+            # a count that still serves is kept, so that dt does not flicker from frame to frame
+            need = last if need <= last <= 1.5 * need else need
+        if need > most:
+            given = f"world.dt > {self.frame_dt / most:.3g}" if dt is not None else limit.remedy
+            given = given if not self.implicit else "a weaker force or a slower start"
+            raise ValueError(
+                f"frame {frame} would need {need} substeps of {self.frame_dt / need:.3g} s, more than "
+                f"world.max_substeps = {most}: {limit.why}; take {given}, or a larger max_substeps"
+            )
+        return need
+
+    def _who(self, chosen: Tensor) -> str:
+        """The first particle of a mask [p]: its number as the caller counts, and where it is or was at rest."""
+        p = int(chosen.nonzero()[0])
+        x = self.rest[p] + self.substeps.state(self.current).u[p]
+        what, x = ("at", x) if bool(torch.isfinite(x).all()) else ("at rest at", self.rest[p])
+        place = ", ".join(f"{value:.4g}" for value in x.tolist())
+        return f"particle {int(self.order[p])} {what} ({place}) m"
 
     def _health(self, now) -> dict[str, float]:
         """Numbers of one frame for a person to look at; SI. energy counts kinetic, elastic and potential energy."""
@@ -365,6 +502,10 @@ class _Solver:
             "angular_momentum_y": float(angular[1]),
             "angular_momentum_z": float(angular[2]),
             "substeps": float(self.counts[-1] if self.counts else 0),
+            "rejected": float(self.work["rejected"]),
+            "out_of_grid": float(self.work["lost"]),
+            "newton_iterations": float(self.work["newton"]),
+            "stiffness_products": float(self.work["products"]),
         }
 
     def _build(self, coefficients: Tensor, q: Tensor, position: Tensor) -> Substeps:
@@ -388,6 +529,7 @@ class _Solver:
                     hooks.append((function, a, b, row))
             a, b = a + width, b + len(boundary.signals(0.0, 0.0))
         selection = [boundary.selection(self.setting) for boundary in self.boundaries]
+        self.bounded = bool(nodes)
         threads = self.threads
         if threads is None:
             threads = min(os.cpu_count() or 1, 8, 1 + len(position) // 4000)

@@ -11,6 +11,7 @@ from physics3d.artifact import AbstractArtifact, require_finite
 from physics3d.mpm.boundaries.base import AbstractBoundary, Vector
 from physics3d.mpm.materials.base import AbstractMaterial
 
+SCHEMES = ("auto", "explicit", "implicit")
 PRECISIONS = {"float32": torch.float32, "float64": torch.float64}
 
 
@@ -42,6 +43,8 @@ class World:
     damping: float = 0.0  # rate at which all velocities decay [1/s]
     cfl: float = 0.5  # cells a wave crosses in one automatic substep
     dt: float | None = None  # substep [s]; None: from the speed of sound and of the particles
+    scheme: str = "auto"  # explicit: follows every wave; implicit: damps those faster than dt; auto: the cheaper one
+    max_substeps: int = 200_000  # in one frame
     precision: str = "float32"
     lower: Vector | None = None  # corners of the simulated region [m]; None: around the body, with room to move
     upper: Vector | None = None
@@ -53,6 +56,8 @@ class World:
         _require(0 < self.cfl <= 1, "cfl", self.cfl, "0 < cfl <= 1")
         _require(0 <= self.damping < math.inf, "damping", self.damping, "a rate >= 0 1/s")
         _require(self.dt is None or self.dt > 0, "dt", self.dt, "a time above 0 s, or None")
+        _require(self.scheme in SCHEMES, "scheme", self.scheme, f"one of {SCHEMES}")
+        _require(self.max_substeps >= 1, "max_substeps", self.max_substeps, "at least 1")
         _require(self.precision in PRECISIONS, "precision", self.precision, f"one of {tuple(PRECISIONS)}")
         finite = len(self.gravity) == 3 and all(math.isfinite(g) for g in self.gravity)
         _require(finite, "gravity", self.gravity, "three finite numbers [m/s^2]")
