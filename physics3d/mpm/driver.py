@@ -6,6 +6,7 @@ parameters.
 """
 
 import functools
+import math
 
 import torch
 import warp as wp
@@ -60,21 +61,29 @@ def uniaxial(
     growth = (stretch.double().diff() / stretch[:-1].double()).to(stretch.dtype)
     guess = torch.zeros((), dtype=stretch.dtype)
     for dt, axial in zip(time.diff().tolist(), growth, strict=True):
-        for _ in range(50):
+        lower, upper = -0.9, 2.0  # of the lateral growth; the traction rises in between
+        for _ in range(100):
             m = guess.detach().requires_grad_()
             with torch.enable_grad():
                 side = sample.trial(dt, _diagonal(axial, m))[1][0, 1, 1]
                 slope = torch.autograd.grad(side, m)[0]
-            if abs(side.item()) <= tolerance * scale:
+            if abs(side.item()) <= tolerance * scale and slope.item() > 0:
                 break
-            guess = torch.clamp(m.detach() - side.detach() / slope, -0.5, 1.0)
+            if side.item() < 0:
+                lower = m.item()
+            else:
+                upper = m.item()
+            newton = m.item() - side.item() / slope.item() if slope.item() > 0 else math.inf
+            guess = guess.new_tensor(newton if lower < newton < upper else (lower + upper) / 2)
         else:
             raise RuntimeError(
                 f"at stretch {axial.item() + 1:g} of one step the sides still carry {side.item():g} Pa; "
                 "take smaller steps, or a material with a bulk stiffness"
             )
-        # one more Newton step, this time in the graph: the exact derivative of the lateral stretch
-        m = guess.detach() - sample.trial(dt, _diagonal(axial, guess.detach()))[1][0, 1, 1] / slope.detach()
+        # the root does not move, but gets its exact derivative: that of a Newton step
+        guess = guess.detach()
+        side = sample.trial(dt, _diagonal(axial, guess))[1][0, 1, 1]
+        m = guess - (side - side.detach()) / slope.detach()
         stress.append(sample.step(dt, _diagonal(axial, m))[0, 0])
         lateral.append(lateral[-1] * (1 + m))
     return torch.stack(stress), torch.stack(lateral)

@@ -8,9 +8,10 @@ Flow relaxes the overstress z = q - tau_y alone: dz/dt = -mu (z/k)^(1/n). In clo
 
     z(t) = z_0 [1 + (m - 1) c]^(-1/(m - 1)),   c = mu t z_0^(m - 1) / k^m       m -> 1 (Bingham): z_0 e^-c
 
-exact for every dt. As in a Maxwell branch (Strang) the stress is taken half relaxed and the fully relaxed strain is
-stored as X = b_e - I: second order. Dissipation q g >= 0. Simo and Hughes, Computational Inelasticity (1998), sec. 1.7
-and 2.7 (overstress); Yue et al. (2015) for the law in MPM.
+exact for every dt. The relaxed strain is stored as X = b_e - I. The stress is that of the mean shear rate of flow over
+the step, q = tau_y + z_0 ((z_0 - z)/(z_0 c))^n: second order, and exact in steady flow however long the step (a half
+relaxed stress, as in a Maxwell branch, is not if dt mu/k is above one). Dissipation q g >= 0. Simo and Hughes,
+Computational Inelasticity (1998), sec. 1.7 and 2.7 (overstress); Yue et al. (2015) for the law in MPM.
 """
 
 import functools
@@ -101,11 +102,11 @@ def _advance(real: type) -> wp.Function:
     relax, carried, store = spectral.relax_hencky(real), base.carried_strain(real), base.store_strain(real)
     decay, expm1, log1p = _decay(real), spectral.expm1(real), spectral.log1p(real)
     root2 = real(math.sqrt(2))
-    most = real(80.0)  # e^80 is still a float32
+    most, least = real(80.0), real(1e-20)  # e^80 is still a float32
 
     @wp.func(name=f"herschel_bulkley_left_{real.__name__}")
     def left(q: real, tau_y: real, z: real, g: real):
-        """-ln of what is left of dev eps when the overstress falls to z e^-g; exact for small g, large q/tau_y."""
+        """-ln of what is left of q when the overstress falls from z to z e^-g; exact for small g and large q/tau_y."""
         change = z / q * expm1(-g)
         if change > real(-0.5):
             return -log1p(change)
@@ -113,8 +114,8 @@ def _advance(real: type) -> wp.Function:
 
     @wp.func(name=f"herschel_bulkley_flow_{real.__name__}")
     def flow(dev: mat33, dt: real, mu: real, tau_y: real, k: real, m: real):
-        """-ln of the factors left of dev eps after half a step and a whole one."""
-        half = real(0.0)
+        """-ln of the factors left of dev eps, in the stress and in what is stored."""
+        mean = real(0.0)
         full = real(0.0)
         size = wp.ddot(dev, dev)
         if dt > real(0.0) and real(2.0) * mu * mu * size > tau_y * tau_y:
@@ -124,9 +125,11 @@ def _advance(real: type) -> wp.Function:
                 s = m - real(1.0)
                 log_c = wp.log(dt * mu / k) + s * wp.log(z / k)
                 c = wp.exp(wp.min(log_c, most))
-                half = left(q, tau_y, z, decay(real(0.5) * c, s))
-                full = left(q, tau_y, z, decay(c, s))
-        return half, full
+                g = decay(c, s)
+                full = left(q, tau_y, z, g)
+                if c > least:
+                    mean = left(q, tau_y, z, (log_c - wp.log(-expm1(-g))) / m)
+        return mean, full
 
     @wp.func(name=f"herschel_bulkley_{real.__name__}")
     def advance(
@@ -145,9 +148,9 @@ def _advance(real: type) -> wp.Function:
         eps, _unrelaxed = relax(X, real(0.0), real(0.0))
         mean = wp.trace(eps) / real(3.0)
         dev = eps - mean * one
-        half, full = flow(dev, dt, mu, coefficients[2, p], coefficients[3, p], coefficients[4, p])
+        relaxed, full = flow(dev, dt, mu, coefficients[2, p], coefficients[3, p], coefficients[4, p])
         _half, X_next = relax(X, full, real(0.0))
         store(p, 0, X_next, memory_next)
-        return H + M + M * H, real(2.0) * mu * wp.exp(-half) * dev + real(3.0) * K * mean * one
+        return H + M + M * H, real(2.0) * mu * wp.exp(-relaxed) * dev + real(3.0) * K * mean * one
 
     return spectral.without_replay(advance)
