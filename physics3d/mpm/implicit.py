@@ -289,7 +289,8 @@ class ImplicitSubsteps:
         size = self._norm(residual)
         while True:
             goal = self.tolerance * (self._spread(free) + self._spread(v)) + self._noise(v)
-            if size <= goal:
+            # within thirty of it, a residual that has stopped falling is rounding too
+            if size <= goal or 0.5 * before <= size <= 30 * goal:
                 return Step(v, newton, products)
             if newton == NEWTON:
                 raise NotConverged(f"Newton has not converged in {NEWTON} iterations")
@@ -315,7 +316,6 @@ class ImplicitSubsteps:
                 secant = slope / (slope - trial_slope) if slope < 0 < trial_slope < math.inf else 0.5
                 a *= min(max(secant, 0.1), 0.5)
             else:
-                # rounding hides the way down: what is left of the step is below what the result is good for
                 if size <= 30 * goal:
                     self._forces(v)
                     return Step(v, newton, products)
