@@ -56,6 +56,7 @@ class Body(AbstractArtifact):
     spacing: float  # distance between neighbours [m]
     embedding: Embedding  # how the moving Gaussians ride on the particles
     attached: Bool[Tensor, " p"] | None = None  # beside something static, which holds them there; None: nothing is
+    parts: tuple[str, ...] = ()  # names of the segmentation's parts; empty: they have none
 
     def held(self, boundaries: tuple[AbstractBoundary, ...]) -> tuple[AbstractBoundary, ...]:
         """What holds the body where it is attached: nothing if the scene's `boundaries` say where it is fixed."""
@@ -74,6 +75,10 @@ class Body(AbstractArtifact):
         ):
             raise ValueError(
                 f"Body: position {tuple(self.position.shape)}, volume, part, interior and attached must have {p} rows"
+            )
+        if self.parts and not 0 <= int(self.part.min()) <= int(self.part.max()) < len(self.parts):
+            raise ValueError(
+                f"Body.part lies in {int(self.part.min())}..{int(self.part.max())}, must be an index of {self.parts}"
             )
         require_finite("Body.position", self.position)
         require_finite("Body.volume", self.volume)

@@ -1,6 +1,6 @@
 """Surface Gaussians -> particles that also occupy the interior."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 
@@ -48,6 +48,7 @@ class Fill:
             attach=self.attach == "auto",
             log=log,
         )
+        body = replace(body, parts=("body",) if segmentation is None else segmentation.parts)
         log.metric("particles", len(body.position))
         log.metric("particles_interior", int(body.interior.sum()))
         log.metric("volume", float(body.volume.double().sum()))

@@ -160,7 +160,7 @@ class Learn:
         def simulate(theta: Tensor):
             return rollout(
                 self.world,
-                field.parameters(theta),
+                self.world.material.per_part(field.parameters(theta), body.part, body.parts),
                 rest,
                 volume,
                 velocity=field.velocity(theta),

@@ -32,7 +32,7 @@ class Simulate:
         with torch.no_grad():
             trajectory = rollout(
                 self.world,
-                estimate.parameters,
+                self.world.material.per_part(estimate.parameters, body.part, body.parts),
                 body.position,
                 body.volume,
                 velocity=estimate.velocity,

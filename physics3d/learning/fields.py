@@ -49,12 +49,12 @@ class GlobalField:
         if not self.span > 1:
             raise ValueError(f"learn.span is {self.span:g}; it must be above 1, e.g. 100")
         for name in members:
-            if name != "poissons_ratio" and not bool((torch.as_tensor(self.start[name]) > 0).all()):
+            if not is_poissons_ratio(name) and not bool((torch.as_tensor(self.start[name]) > 0).all()):
                 raise ValueError(
                     f"{name} starts at {float(torch.as_tensor(self.start[name]).min()):g} and is learned as a "
                     "logarithm; start it above 0 or take it out of learn.learn"
                 )
-        if any("poissons_ratio" in group and len(group) > 1 for group in groups):
+        if any(len(group) > 1 and any(map(is_poissons_ratio, group)) for group in groups):
             raise ValueError("learn.ties holds poissons_ratio; it has no scale to share, learn it by itself")
 
     @property
@@ -83,7 +83,7 @@ class GlobalField:
         for offset, group in zip(theta, self.groups):
             for name in group:
                 values[name] = (
-                    poissons_ratio(values[name], offset) if name == "poissons_ratio" else values[name] * offset.exp()
+                    poissons_ratio(values[name], offset) if is_poissons_ratio(name) else values[name] * offset.exp()
                 )
         return values
 
@@ -91,6 +91,11 @@ class GlobalField:
         """Initial velocity [m/s], differentiable in theta."""
         start = self.start_velocity.to(theta)
         return start if self.velocity_scale is None else start + self.velocity_scale * theta[-3:]
+
+
+def is_poissons_ratio(name: str) -> bool:
+    """Of the body, or of a part of it (part.poissons_ratio)."""
+    return name.rpartition(".")[2] == "poissons_ratio"
 
 
 def poissons_ratio(start: Tensor, offset: Tensor) -> Tensor:
