@@ -43,7 +43,7 @@ LEAST_FRACTION = 0.25  # a cell filled less than this is no particle of its own
 SUBDIVISION = 4  # samples along each side of a boundary cell
 ISOLATED = ("attach", "drop", "keep")  # what may become of a piece
 JOINT = 4.0  # widest gap that is bridged [spacings]: two cells of the simulation grid
-CONTACT = 1.0  # a particle nearer to a static Gaussian is held by it [spacings]
+CONTACT = 0.75  # a particle nearer to a static Gaussian is held by it [spacings]; more would hold what is free above it
 SPECK = 0.05  # static clusters of less than this share are mistakes of the segmentation and hold nothing
 
 

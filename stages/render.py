@@ -7,6 +7,7 @@ import torch
 from physics3d.filling import Body
 from physics3d.gaussians.cameras import Camera
 from physics3d.gaussians.deform import render_deformed
+from physics3d.gaussians.interior import Interior, paint
 from physics3d.gaussians.model import Gaussians
 from physics3d.log import Log
 from physics3d.mpm.rollout import Trajectory
@@ -24,6 +25,8 @@ class Render:
 
     view: int | str | None = None  # index or name of the photograph whose camera is used; None: the first one
     scale: float = 1.0  # pixels of the video per pixel of the camera, along each side
+    interior: bool = True  # draw the inside, in the colours of the surface, where the body opens
+    paint: int = 0  # steps by which the colours of the inside are refined on the photographs' cameras (L_Fill)
     device: str = "cpu"
 
     def __call__(
@@ -35,13 +38,16 @@ class Render:
         embedding = body.embedding
         rest = trajectory.rest_position.to(self.device)
         background = torch.tensor(capture.background, device=self.device)
+        inside = self.inside(capture, model, body, trajectory, log) if self.interior else None
         videos: dict[str, list[torch.Tensor]] = {name: [] for name in cameras}
         count = len(trajectory.position)
         for x, F in log.progress(zip(trajectory.position, trajectory.deformation), "render", total=count):
             x, F = x.to(self.device), F.to(self.device)
             for name, camera in cameras.items():
                 with torch.no_grad():
-                    image = render_deformed(model, embedding, rest, x, F, camera, background=background)
+                    image = render_deformed(
+                        model, embedding, rest, x, F, camera, background=background, interior=inside
+                    )
                 videos[name].append(to_uint8(image.color))
         frames = {name: torch.stack(images) for name, images in videos.items()}
         for name, video in frames.items():
@@ -50,6 +56,27 @@ class Render:
             log.image(f"{name}_space_time", space_time_slice(video, row=video.shape[1] // 2))
         log.info(f"{count} frames from {len(frames)} camera(s): {', '.join(f'{name}.mp4' for name in frames)}")
         return Video(frames=tuple(frames.values()), names=tuple(frames), fps=trajectory.fps)
+
+    def inside(
+        self, capture: Capture, model: Gaussians, body: Body, trajectory: Trajectory, log: Log
+    ) -> Interior | None:
+        """Gaussians of the filled particles; None where the body has no inside or never opens."""
+        surface = model.select(body.embedding.which.to(model.mean.device)).to("cpu")
+        found = Interior.of(surface, body.position, body.interior, body.spacing)
+        if found is None:
+            return None
+        widest = torch.stack([found.opened(trajectory.rest_position, x) for x in trajectory.position]).amax(0)
+        count = int((widest > 0).sum())
+        log.metric("interior_shown", count)
+        if count == 0:
+            log.info(f"the body never opens: its {len(widest)} inner Gaussians are not drawn")
+            return None
+        log.info(f"the body opens: {count} of its {len(widest)} inner Gaussians show")
+        found = found.to(self.device)
+        if self.paint and capture.cameras:
+            cameras = [c for i, c in enumerate(capture.cameras) if i not in capture.held_out]
+            found = paint(found, model, cameras, background=capture.background, steps=self.paint, log=log)
+        return found
 
     def cameras(self, capture: Capture) -> dict[str, Camera]:
         """The cameras of the video by name; `camera<i>` is number i of the take."""

@@ -131,3 +131,11 @@ def spheres_on_table(rng) -> tuple[Gaussians, torch.Tensor, torch.Tensor]:
     )
     truth = torch.cat([torch.full((len(g),), k) for k, g in enumerate(parts)])
     return joined(*parts), truth, torch.cat([g.opacity for g in parts])
+
+
+def petal(n, rng, *, length=0.1, width=0.06, bend=0.06):
+    """A sheet bent about the y axis with radius `bend`: (points, normals), area [m^2]."""
+    s, t = rng.uniform(-length / 2, length / 2, n), rng.uniform(-width / 2, width / 2, n)
+    a = s / bend
+    normal = np.stack([np.sin(a), 0 * a, np.cos(a)], 1)
+    return (bend * normal + t[:, None] * np.array([0.0, 1.0, 0.0]), normal), length * width

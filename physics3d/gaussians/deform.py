@@ -19,6 +19,7 @@ from torch import Tensor
 
 from physics3d.artifact import AbstractArtifact, require_finite
 from physics3d.gaussians.cameras import Camera
+from physics3d.gaussians.interior import Interior
 from physics3d.gaussians.model import Gaussians
 from physics3d.gaussians.rasterize import Rendered, rasterize
 from physics3d.gaussians.sh import sh_color
@@ -158,14 +159,23 @@ def render_deformed(
     camera: Camera,
     *,
     background: Float[Tensor, " 3"] | tuple[float, float, float],
+    interior: Interior | None = None,
 ) -> Rendered:
-    """Draw the Gaussians where the particles have carried them; differentiable in x, F and the model's appearance."""
+    """Draw the Gaussians where the particles have carried them; differentiable in x, F and the model's appearance.
+
+    Those of the `interior` are drawn where the body has opened.
+    """
     mean, covariance, rotation = carry(gaussians, embedding, X, x, F)
     direction = mean - camera.centre.to(mean)
     if rotation is not None:
         direction = torch.einsum("nji,nj->ni", rotation, torch.nn.functional.normalize(direction, dim=-1))
     color = sh_color(gaussians.sh, direction.to(gaussians.sh))
-    return rasterize(mean, covariance, gaussians.opacity, color, camera, background=background)
+    drawn = mean, covariance, gaussians.opacity, color
+    if interior is not None:
+        inner = interior.drawn(X, x)
+        if len(inner[0]):
+            drawn = tuple(torch.cat([a, b.to(a)]) for a, b in zip(drawn, inner, strict=True))  # type: ignore[assignment]
+    return rasterize(*drawn, camera, background=background)
 
 
 class _Rotation(torch.autograd.Function):
