@@ -1,6 +1,9 @@
-"""Fixed region: nothing moves in this box, as if it were clamped (a stem in its pot, the held end of a bar)."""
+"""Fixed region: nothing moves in this box, as if it were clamped (a stem in its pot, the held end of a bar).
+
+For good, or for start <= t < start + duration (held, then let go)."""
 
 import functools
+import math
 from dataclasses import dataclass
 
 import torch
@@ -18,14 +21,20 @@ class FixedRegion(base.AbstractBoundary):
 
     lower: base.Vector
     upper: base.Vector
+    start: float = 0.0  # [s]
+    duration: float = math.inf  # [s]
 
     def check(self) -> None:
         base.require_box(self)
+        base.require_window(self)
 
     def parameters(self, setting: base.Setting) -> Float[Tensor, "6"]:
         slack = 1e-3 * setting.dx  # a node on the surface belongs to the region whatever the rounding
         lower = torch.tensor(self.lower, dtype=torch.float64) - slack
         return torch.cat([lower, torch.tensor(self.upper, dtype=torch.float64) + slack])
+
+    def signals(self, t: float, dt: float) -> tuple[float]:
+        return (float(self.start <= t < self.start + self.duration),)
 
     def node(self, real: type) -> wp.Function:
         return _node(real)
@@ -48,7 +57,7 @@ def _node(real: type) -> wp.Function:
         result = v
         above = x[0] >= q[a] and x[1] >= q[a + 1] and x[2] >= q[a + 2]
         below = x[0] <= q[a + 3] and x[1] <= q[a + 4] and x[2] <= q[a + 5]
-        if above and below:
+        if clock[row, b] > real(0.0) and above and below:
             result = vec3()
         return result
 

@@ -1,8 +1,9 @@
-"""Impulse: a total force on the particles of a ball, for some time; a poke, a gust, the start of every paper video.
+"""Impulse: a total force on part of the body for some time; a poke, a gust, the start of every paper video.
 
-    a(t) = force / m(ball),  start <= t < start + duration,  for the particles within `radius` of `centre` AT REST
+    a(t) = force / m(part)  or  acceleration,   start <= t < start + duration,   for the particles AT REST in the region
 
-The force follows the material, and the momentum it gives is force * duration exactly, whatever the substep.
+The region is a ball (centre, radius), a box (lower, upper), or the so many particles `nearest` to a centre. The force
+follows the material, and the momentum it gives is force * duration exactly, whatever the substep.
 """
 
 import functools
@@ -19,30 +20,56 @@ from physics3d.mpm.transfer import vector
 
 @dataclass(frozen=True, kw_only=True)
 class Impulse(base.AbstractBoundary):
-    """Total force [N] over a ball (centre, radius [m]) of rest positions in a window of time [s].
+    """Total force [N] on the particles of a region, or acceleration [m/s^2] of each, in a window of time [s].
 
-    The force may be a tensor of three, and the trajectory is differentiable with respect to it. For a momentum P [N s]
+    Either may be a tensor of three, and the trajectory is differentiable with respect to it. For a momentum P [N s]
     take force = P/duration."""
 
-    force: base.Vector | Tensor
-    centre: base.Vector
-    radius: float
+    force: base.Vector | Tensor | None = None  # in total [N]
+    acceleration_of_each: base.Vector | Tensor | None = None  # [m/s^2]
+    centre: base.Vector | None = None  # [m]
+    radius: float | None = None  # [m]
+    nearest: int | None = None  # particles
+    lower: base.Vector | None = None  # corners of a box [m]
+    upper: base.Vector | None = None
     start: float = 0.0
     duration: float
 
     def check(self) -> None:
-        base.require_finite(self, "force", "centre", "radius")
-        base.require(len(self.force) == 3, self, "force", "three numbers [N]")
-        base.require(self.radius > 0, self, "radius", "a length above 0 m")
+        base.require((self.force is None) != (self.acceleration_of_each is None), self, "force",
+                     "a force or an acceleration_of_each")  # fmt: skip
+        what, unit = ("force", "N") if self.force is not None else ("acceleration_of_each", "m/s^2")
+        base.require_finite(self, what)
+        base.require(len(getattr(self, what)) == 3, self, what, f"three numbers [{unit}]")
+        given = [name for name in ("radius", "nearest", "lower") if getattr(self, name) is not None]
+        base.require(
+            len(given) == 1, self, "radius", "one region: centre and radius, centre and nearest, or lower and upper"
+        )
+        base.require((self.lower is None) == (self.upper is None), self, "upper", "both corners or neither")
+        base.require((self.centre is None) == (self.upper is not None), self, "centre", "one for radius or nearest")
+        if self.lower is not None:
+            base.require_box(self)
+        else:
+            base.require_finite(self, "centre", given[0])
+            base.require(getattr(self, given[0]) > 0, self, given[0], "a radius above 0 m, or at least 1 particle")
         base.require_window(self)
 
     def selection(self, setting: base.Setting) -> Float[Tensor, " p"]:
-        distance = (setting.position - setting.position.new_tensor(self.centre)).norm(dim=1)
-        selected = (distance <= self.radius).to(torch.float64)
+        if self.lower is not None and self.upper is not None:
+            selected = base.inside_box(setting.position, self.lower, self.upper)
+        else:
+            distance = (setting.position - setting.position.new_tensor(self.centre)).norm(dim=1)
+            if self.radius is not None:
+                selected = (distance <= self.radius).to(torch.float64)
+            else:
+                selected = torch.zeros_like(distance)
+                selected[distance.argsort(stable=True)[: self.nearest]] = 1.0
         base.require_selected(self, selected)
         return selected
 
     def parameters(self, setting: base.Setting) -> Float[Tensor, "3"]:
+        if self.acceleration_of_each is not None:
+            return torch.as_tensor(self.acceleration_of_each, dtype=torch.float64).cpu()
         mass = (self.selection(setting) * setting.mass).sum()
         return torch.as_tensor(self.force, dtype=torch.float64).cpu() / mass
 
