@@ -11,7 +11,8 @@ which a CPU's compiler turns into wide instructions. On a CPU the square is the 
 length one).
 """
 
-# mypy: ignore-errors (to a type checker, Warp kernels are another language)
+# To a type checker, Warp kernels are another language.
+# mypy: ignore-errors
 # ruff: noqa: UP018, RUF046, SIM102 (in a kernel a literal is a constant, int(0) a variable; `and` evaluates both sides)
 
 from dataclasses import dataclass
@@ -90,41 +91,44 @@ def _view(real):
 @cache
 def _projection(real, tile: int, cutoff: float):
     vec3, mat33, entry, View = wp.types.vector(3, real), wp.types.matrix((3, 3), real), _entry(real), _view(real)
-    TILE, CUTOFF, PASS, CLOSE, SIDEWAYS = tile, real(cutoff), real(LOW_PASS), real(NEAR), real(MARGIN)
-    zero, one, two, half = real(0.0), real(1.0), real(2.0), real(0.5)
+    TILE, STEP, CUTOFF = tile, real(tile), real(cutoff)
+    PASS, CLOSE, SIDEWAYS = real(LOW_PASS), real(NEAR), real(MARGIN)
 
     @wp.func
     def held(x: real, f: real, c: real, size: int) -> real:
         """The ray's slope, held constant outside the picture."""
         n = real(size)
-        return wp.clamp(x, (-SIDEWAYS * n - c) / f, ((one + SIDEWAYS) * n - c) / f)
+        return wp.clamp(x, (-SIDEWAYS * n - c) / f, ((real(1.0) + SIDEWAYS) * n - c) / f)
 
     @wp.func
     def tile_rows(s: entry, height: int) -> wp.vec2i:
         """First row of tiles that the ellipse alpha = cutoff touches, and one past the last."""
-        reach = wp.sqrt(two * wp.log(s[6] / CUTOFF) / s[5]) / real(TILE)
+        reach = wp.sqrt(real(2.0) * wp.log(s[6] / CUTOFF) / s[5]) / STEP
         n = real((height + TILE - 1) // TILE)
-        v = s[1] / real(TILE)
-        return wp.vec2i(int(wp.clamp(wp.floor(v - reach), zero, n)), int(wp.clamp(wp.floor(v + reach) + one, zero, n)))
+        v = s[1] / STEP
+        return wp.vec2i(
+            int(wp.clamp(wp.floor(v - reach), real(0.0), n)),
+            int(wp.clamp(wp.floor(v + reach) + real(1.0), real(0.0), n)),
+        )
 
     @wp.func
     def tile_columns(s: entry, row: int, width: int) -> wp.vec2i:
         """The same for the tiles of one row: where the ellipse, inside that band of pixels, is widest."""
-        limit = two * wp.log(s[6] / CUTOFF)
+        limit = real(2.0) * wp.log(s[6] / CUTOFF)
         d0 = real(row * TILE) - s[1]
-        d1 = d0 + real(TILE)
+        d1 = d0 + STEP
         # the ellipse is widest to the right at dy = top, to the left at dy = -top
         slope = s[3] * s[4]  # A s;  Sigma'_uu = 1/A + s^2/p
         top = slope / s[5] * wp.sqrt(limit / (s[3] + slope * slope / s[5]))
         right = wp.clamp(top, d0, d1)
         left = wp.clamp(-top, d0, d1)
-        far = s[0] + s[4] * right + wp.sqrt(wp.max(limit - s[5] * right * right, zero) / s[3])
-        near = s[0] + s[4] * left - wp.sqrt(wp.max(limit - s[5] * left * left, zero) / s[3])
+        far = s[0] + s[4] * right + wp.sqrt(wp.max(limit - s[5] * right * right, real(0.0)) / s[3])
+        near = s[0] + s[4] * left - wp.sqrt(wp.max(limit - s[5] * left * left, real(0.0)) / s[3])
         n = real((width + TILE - 1) // TILE)
         # a little wider, so that rounding loses no pixel
         return wp.vec2i(
-            int(wp.clamp(wp.floor((near - real(0.01)) / real(TILE)), zero, n)),
-            int(wp.clamp(wp.floor((far + real(0.01)) / real(TILE)) + one, zero, n)),
+            int(wp.clamp(wp.floor((near - real(0.01)) / STEP), real(0.0), n)),
+            int(wp.clamp(wp.floor((far + real(0.01)) / STEP) + real(1.0), real(0.0), n)),
         )
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -151,17 +155,17 @@ def _projection(real, tile: int, cutoff: float):
         if X[2] > CLOSE and opacity[i] >= CUTOFF:
             x = X[0] / X[2]
             y = X[1] / X[2]
-            ju = (view.fx / X[2]) * vec3(one, zero, -held(x, view.fx, view.cx, view.width))
-            jv = (view.fy / X[2]) * vec3(zero, one, -held(y, view.fy, view.cy, view.height))
+            ju = (view.fx / X[2]) * vec3(real(1.0), real(0.0), -held(x, view.fx, view.cx, view.width))
+            jv = (view.fy / X[2]) * vec3(real(0.0), real(1.0), -held(y, view.fy, view.cy, view.height))
             ru = ju @ view.R
             rv = jv @ view.R
-            S = half * (covariance[i] + wp.transpose(covariance[i]))
+            S = real(0.5) * (covariance[i] + wp.transpose(covariance[i]))
             sv = S @ rv
             a = wp.dot(ru, S @ ru)
             b = wp.dot(ru, sv)
             c = wp.dot(rv, sv)
             # det(Sigma' + s I) = det Sigma' + s tr Sigma' + s^2, which rounding cannot make negative
-            bare = wp.max(a * c - b * b, zero)
+            bare = wp.max(a * c - b * b, real(0.0))
             det = bare + PASS * (a + c) + PASS * PASS
             o = opacity[i]
             if view.antialiased == 1:
@@ -170,7 +174,7 @@ def _projection(real, tile: int, cutoff: float):
                 q = color[i]
                 out = entry(
                     view.fx * x + view.cx, view.fy * y + view.cy, X[2],
-                    (c + PASS) / det, b / (c + PASS), one / (c + PASS), o, q[0], q[1], q[2],
+                    (c + PASS) / det, b / (c + PASS), real(1.0) / (c + PASS), o, q[0], q[1], q[2],
                 )  # fmt: skip
                 rows = tile_rows(out, view.height)
                 for row in range(rows[0], rows[1]):
@@ -225,7 +229,7 @@ def _projection(real, tile: int, cutoff: float):
         i = begin + wp.tid()
         X_bar = vec3()
         S_bar = mat33()
-        o_bar = zero
+        o_bar = real(0.0)
         q_bar = vec3()
         if count[i] > 0:
             bar = entry()
@@ -239,39 +243,39 @@ def _projection(real, tile: int, cutoff: float):
             yj = held(y, view.fy, view.cy, view.height)
             fu = view.fx / X[2]
             fv = view.fy / X[2]
-            ru = fu * vec3(one, zero, -xj) @ view.R
-            rv = fv * vec3(zero, one, -yj) @ view.R
-            S = half * (covariance[i] + wp.transpose(covariance[i]))
+            ru = fu * vec3(real(1.0), real(0.0), -xj) @ view.R
+            rv = fv * vec3(real(0.0), real(1.0), -yj) @ view.R
+            S = real(0.5) * (covariance[i] + wp.transpose(covariance[i]))
             su = S @ ru
             sv = S @ rv
             a = wp.dot(ru, su)
             b = wp.dot(ru, sv)
             c = wp.dot(rv, sv)
-            bare = wp.max(a * c - b * b, zero)
+            bare = wp.max(a * c - b * b, real(0.0))
             det = bare + PASS * (a + c) + PASS * PASS
-            p = one / (c + PASS)
+            p = real(1.0) / (c + PASS)
             s = b * p
             # A = (c + PASS) / det, s = b p, p = 1 / (c + PASS)
             c_bar = bar[3] / det - (bar[4] * s + bar[5] * p) * p
             b_bar = bar[4] * p
             det_bar = -bar[3] / (p * det * det)
-            bare_bar = zero
+            bare_bar = real(0.0)
             o_bar = bar[6]
             if view.antialiased == 1:
                 rho = wp.sqrt(bare / det)
                 o_bar = bar[6] * rho
-                ratio_bar = bar[6] * opacity[i] / (two * rho)
+                ratio_bar = bar[6] * opacity[i] / (real(2.0) * rho)
                 bare_bar = ratio_bar / det
                 det_bar -= ratio_bar * bare / (det * det)
             # det = bare + PASS (a + c) + PASS^2, bare = a c - b^2
             bare_bar += det_bar
             a_bar = det_bar * PASS + bare_bar * c
             c_bar += det_bar * PASS + bare_bar * a
-            b_bar -= two * b * bare_bar
-            cross = half * b_bar * wp.outer(ru, rv)
+            b_bar -= real(2.0) * b * bare_bar
+            cross = real(0.5) * b_bar * wp.outer(ru, rv)
             S_bar = a_bar * wp.outer(ru, ru) + c_bar * wp.outer(rv, rv) + cross + wp.transpose(cross)
-            ju_bar = view.R @ (two * a_bar * su + b_bar * sv)
-            jv_bar = view.R @ (two * c_bar * sv + b_bar * su)
+            ju_bar = view.R @ (real(2.0) * a_bar * su + b_bar * sv)
+            jv_bar = view.R @ (real(2.0) * c_bar * sv + b_bar * su)
             x_bar = bar[0] * view.fx
             y_bar = bar[1] * view.fy
             if x == xj:
@@ -294,7 +298,6 @@ def _blending(real, side: int, numerics: Numerics):
     integers = wp.types.vector(side, wp.int32)
     SIDE, TILE, MOST = side, numerics.tile, real(ALPHA_MAX)
     CUTOFF, STOP = real(numerics.cutoff), real(numerics.stop)
-    zero, half, one, two = real(0.0), real(0.5), real(1.0), real(2.0)
     # loops over pixels stay loops, which the compiler turns into wide instructions
     options = {
         "max_unroll": 1,
@@ -315,9 +318,9 @@ def _blending(real, side: int, numerics: Numerics):
         def decay(e: real) -> real:
             """exp(-e) for e >= 0."""
             t = wp.max(L * e, K)
-            n = int(t - half)
+            n = int(t - real(0.5))
             f = t - real(n)
-            series = one + f * (a1 + f * (a2 + f * (a3 + f * (a4 + f * (a5 + f * a6)))))
+            series = real(1.0) + f * (a1 + f * (a2 + f * (a3 + f * (a4 + f * (a5 + f * a6)))))
             return series * wp.cast((n + 127) << 23, wp.float32)
 
     else:
@@ -340,15 +343,15 @@ def _blending(real, side: int, numerics: Numerics):
     @wp.func
     def rows(s: entry, y0: int, y1: int) -> wp.vec2i:
         """Rows of pixels, of y0..y1, that the ellipse alpha = cutoff touches."""
-        reach = wp.sqrt(two * wp.log(s[6] / CUTOFF) / s[5])
-        first = wp.clamp(wp.ceil(s[1] - reach - half), real(y0), real(y1))
-        last = wp.clamp(wp.floor(s[1] + reach - half) + one, real(y0), real(y1))
+        reach = wp.sqrt(real(2.0) * wp.log(s[6] / CUTOFF) / s[5])
+        first = wp.clamp(wp.ceil(s[1] - reach - real(0.5)), real(y0), real(y1))
+        last = wp.clamp(wp.floor(s[1] + reach - real(0.5)) + real(1.0), real(y0), real(y1))
         return wp.vec2i(int(first), int(last))
 
     @wp.func
     def light(T: row) -> int:
         """1 if any pixel of the row still lets light through."""
-        most = zero
+        most = real(0.0)
         for x in range(SIDE):
             most = wp.max(most, T[x])
         return wp.where(most >= STOP, 1, 0)
@@ -380,7 +383,7 @@ def _blending(real, side: int, numerics: Numerics):
         for y in range(y1 - y0):
             T = row()
             for x in range(nx):
-                T[x] = one
+                T[x] = real(1.0)
             rays[0, y] = T
         k = start[corner[2]]
         end = start[corner[2] + 1]
@@ -388,13 +391,13 @@ def _blending(real, side: int, numerics: Numerics):
         while k < end and open == 1:
             s = splat[gaussian[k]]
             k += 1
-            u = s[0] - real(x0) - half
+            u = s[0] - real(x0) - real(0.5)
             span = rows(s, y0, y1)
             for y in range(span[0], span[1]):
-                dy = real(y) + half - s[1]
+                dy = real(y) + real(0.5) - s[1]
                 mid = u + s[4] * dy
-                e0 = half * s[5] * dy * dy
-                e2 = half * s[3]
+                e0 = real(0.5) * s[5] * dy * dy
+                e2 = real(0.5) * s[3]
                 T = rays[0, y - y0]
                 r = rays[1, y - y0]
                 g = rays[2, y - y0]
@@ -405,8 +408,8 @@ def _blending(real, side: int, numerics: Numerics):
                     a = wp.min(s[6] * decay(e2 * dx * dx + e0), MOST)
                     t = T[x]
                     w = t * a
-                    w = wp.where(a >= CUTOFF, w, zero)
-                    w = wp.where(t >= STOP, w, zero)
+                    w = wp.where(a >= CUTOFF, w, real(0.0))
+                    w = wp.where(t >= STOP, w, real(0.0))
                     T[x] = t - w
                     r[x] = r[x] + w * s[7]
                     g[x] = g[x] + w * s[8]
@@ -432,8 +435,8 @@ def _blending(real, side: int, numerics: Numerics):
                 color[y0 + y, x0 + x, 0] = r[x] + t * background[0]
                 color[y0 + y, x0 + x, 1] = g[x] + t * background[1]
                 color[y0 + y, x0 + x, 2] = b[x] + t * background[2]
-                alpha[y0 + y, x0 + x] = one - t
-                depth[y0 + y, x0 + x] = wp.where(t < one, z[x] / wp.max(one - t, real(1e-9)), zero)
+                alpha[y0 + y, x0 + x] = real(1.0) - t
+                depth[y0 + y, x0 + x] = wp.where(t < real(1.0), z[x] / wp.max(real(1.0) - t, real(1e-9)), real(0.0))
                 clear[y0 + y, x0 + x] = t
 
     @wp.kernel(module="unique", enable_backward=False, module_options=options)
@@ -473,7 +476,7 @@ def _blending(real, side: int, numerics: Numerics):
             b = row()
             z = row()
             for x in range(nx):
-                T[x] = one
+                T[x] = real(1.0)
                 i = y0 + y
                 j = x0 + x
                 if color_bar.shape[0] > 0:
@@ -484,7 +487,7 @@ def _blending(real, side: int, numerics: Numerics):
                 if alpha_bar.shape[0] > 0:
                     rest[x] = rest[x] - alpha_bar[i, j] * clear[i, j]
                 if depth_bar.shape[0] > 0:
-                    if alpha[i, j] > zero:
+                    if alpha[i, j] > real(0.0):
                         z[x] = depth_bar[i, j] / alpha[i, j]
                         rest[x] = rest[x] + z[x] * depth[i, j]
             rays[0, y] = T
@@ -500,7 +503,7 @@ def _blending(real, side: int, numerics: Numerics):
             i = gaussian[k]
             s = splat[i]
             k += 1
-            u = s[0] - real(x0) - half
+            u = s[0] - real(x0) - real(0.5)
             span = rows(s, y0, y1)
             # sums over pixels, of e_bar, the adjoint of the exponent, its moments, and of w times the pixels' adjoints
             m0 = row()
@@ -514,10 +517,10 @@ def _blending(real, side: int, numerics: Numerics):
             cb = row()
             cz = row()
             for y in range(span[0], span[1]):
-                dy = real(y) + half - s[1]
+                dy = real(y) + real(0.5) - s[1]
                 mid = u + s[4] * dy
-                e0 = half * s[5] * dy * dy
-                e2 = half * s[3]
+                e0 = real(0.5) * s[5] * dy * dy
+                e2 = real(0.5) * s[3]
                 T = rays[0, y - y0]
                 rest = rays[1, y - y0]
                 r = rays[2, y - y0]
@@ -528,8 +531,8 @@ def _blending(real, side: int, numerics: Numerics):
                     dx = real(x) - mid
                     a = wp.min(s[6] * decay(e2 * dx * dx + e0), MOST)
                     t = T[x]
-                    a = wp.where(a >= CUTOFF, a, zero)
-                    a = wp.where(t >= STOP, a, zero)
+                    a = wp.where(a >= CUTOFF, a, real(0.0))
+                    a = wp.where(t >= STOP, a, real(0.0))
                     w = t * a
                     T[x] = t - w
                     value = r[x] * s[7] + g[x] * s[8] + b[x] * s[9] + z[x] * s[2]
@@ -539,8 +542,8 @@ def _blending(real, side: int, numerics: Numerics):
                     cg[x] = cg[x] + w * g[x]
                     cb[x] = cb[x] + w * b[x]
                     cz[x] = cz[x] + w * z[x]
-                    e_bar = a * behind / (one - a) - w * value
-                    e_bar = wp.where(a < MOST, e_bar, zero)
+                    e_bar = a * behind / (real(1.0) - a) - w * value
+                    e_bar = wp.where(a < MOST, e_bar, real(0.0))
                     ex = e_bar * dx
                     m0[x] = m0[x] + e_bar
                     m1[x] = m1[x] + ex
@@ -552,16 +555,16 @@ def _blending(real, side: int, numerics: Numerics):
                 rays[1, y - y0] = rest
             if span[0] < span[1]:
                 bar = entry()
-                tx = zero
-                ty = zero
-                txy = zero
+                tx = real(0.0)
+                ty = real(0.0)
+                txy = real(0.0)
                 for x in range(SIDE):
                     tx += m1[x]
                     ty += my[x]
                     txy += mxy[x]
                     bar[2] = bar[2] + cz[x]
-                    bar[3] = bar[3] + half * m2[x]
-                    bar[5] = bar[5] + half * myy[x]
+                    bar[3] = bar[3] + real(0.5) * m2[x]
+                    bar[5] = bar[5] + real(0.5) * myy[x]
                     bar[6] = bar[6] - m0[x]
                     bar[7] = bar[7] + cr[x]
                     bar[8] = bar[8] + cg[x]
@@ -600,7 +603,7 @@ def _blending(real, side: int, numerics: Numerics):
         for y in range(y1 - y0):
             T = row()
             for x in range(nx):
-                T[x] = one
+                T[x] = real(1.0)
             clear[y] = T
             found[y] = integers(-1)
         k = start[corner[2]]
@@ -610,23 +613,23 @@ def _blending(real, side: int, numerics: Numerics):
             i = gaussian[k]
             s = splat[i]
             k += 1
-            u = s[0] - real(x0) - half
+            u = s[0] - real(x0) - real(0.5)
             span = rows(s, y0, y1)
             for y in range(span[0], span[1]):
-                dy = real(y) + half - s[1]
+                dy = real(y) + real(0.5) - s[1]
                 mid = u + s[4] * dy
-                e0 = half * s[5] * dy * dy
-                e2 = half * s[3]
+                e0 = real(0.5) * s[5] * dy * dy
+                e2 = real(0.5) * s[3]
                 T = clear[y - y0]
                 at = found[y - y0]
                 for x in range(SIDE):
                     dx = real(x) - mid
                     a = wp.min(s[6] * decay(e2 * dx * dx + e0), MOST)
                     t = T[x]
-                    w = t * wp.where(a >= CUTOFF, a, zero)
-                    w = wp.where(t >= STOP, w, zero)
+                    w = t * wp.where(a >= CUTOFF, a, real(0.0))
+                    w = wp.where(t >= STOP, w, real(0.0))
                     T[x] = t - w
-                    at[x] = wp.where(t >= half and t - w < half, i, at[x])
+                    at[x] = wp.where(t >= real(0.5) and t - w < real(0.5), i, at[x])
                 clear[y - y0] = T
                 found[y - y0] = at
             if k % wp.static(LOOK) == 0:

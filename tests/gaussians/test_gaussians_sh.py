@@ -34,6 +34,14 @@ def test_constant_term_alone_is_the_same_from_everywhere(k):
     torch.testing.assert_close(sh_color(sh, direction), torch.tensor([0.2, 0.5, 0.9]).expand(5, 3))
 
 
+@pytest.mark.parametrize("k", [1, 4, 9, 16])
+def test_gradients_are_finite_differences(k):
+    g = torch.Generator().manual_seed(k)
+    sh, direction = (torch.randn(4, *shape, generator=g, dtype=torch.float64) for shape in ((k, 3), (3,)))
+    sh[:, 0] += 2  # away from the kink at black
+    assert torch.autograd.gradcheck(sh_color, (sh.requires_grad_(), direction.requires_grad_()))
+
+
 def test_colour_is_never_negative():
     assert (sh_color(torch.full((2, 1, 3), -9.0), torch.ones(2, 3)) == 0).all()
 
