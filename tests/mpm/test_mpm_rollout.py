@@ -122,9 +122,9 @@ def test_vibrating_bar():
         u, shape, t = bar(cells, Viscoelastic(branches=0), start, seconds=2.0, frames=41)
         w = math.pi / 2 * math.sqrt(M_E / 1000.0)
         errors.append(relative_error(u, (torch.sin(w * t) / w)[:, None] * shape))
-    # first order in dx, because the wall zeroes a node and not the material at its face
-    assert errors[1] < 0.1
-    assert errors[1] < 0.65 * errors[0]
+    # second order in dx, because the wall mirrors: 0.16 % at 32 cells
+    assert errors[1] < 2e-3
+    assert errors[1] < 0.3 * errors[0]
 
 
 def modal_curve(t: torch.Tensor) -> torch.Tensor:
@@ -163,9 +163,9 @@ def test_viscoelastic_bar():
     for cells in (16, 32):
         u, shape, t = bar(cells, Viscoelastic(branches=1), start, seconds=2.0, frames=41)
         errors.append(relative_error(u, modal_curve(t)[:, None] * shape))
-    # 1-D MPM with velocities zeroed at the wall node has 4 % at 32 cells, 8 % at 16: first order
-    assert errors[1] < 0.05
-    assert errors[1] < 0.65 * errors[0]
+    # second order, 0.15 % at 32 cells; with velocities zeroed on and behind the wall it would be 3.4 %, first order
+    assert errors[1] < 2e-3
+    assert errors[1] < 0.3 * errors[0]
 
 
 def test_column_sags_under_its_own_weight():
@@ -180,10 +180,10 @@ def test_column_sags_under_its_own_weight():
     M = 1e6 * 0.7 / (1.3 * 0.4)
     exact = -(1000 * 9.81 / M) * (length * z - z**2 / 2)
     u = (trajectory.position[-1] - position)[:, 2]
-    # 8 cells, first order at the ground
-    assert relative_error(u, exact) < 0.12
+    # 8 cells, second order at the ground: 0.4 %; the stress of particles wavers more than their place, 2.3 %
+    assert relative_error(u, exact) < 0.01
     stress = M * (trajectory.deformation[-1, :, 2, 2] - 1)
-    assert relative_error(stress[z > dx], (-1000 * 9.81 * (length - z))[z > dx]) < 0.12
+    assert relative_error(stress[z > dx], (-1000 * 9.81 * (length - z))[z > dx]) < 0.04
 
 
 def test_cantilever_vibrates_at_its_first_frequency():
