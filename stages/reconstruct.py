@@ -4,12 +4,16 @@ from dataclasses import dataclass, field
 
 import torch
 
+from physics3d.gaussians.densify import AbstractDensification, Adaptive
 from physics3d.gaussians.fit import Photograph, Rates, background_points, fit, from_points, held_out_psnr, random_points
+from physics3d.gaussians.floaters import floaters
 from physics3d.gaussians.model import Gaussians
 from physics3d.gaussians.ply import write_ply
 from physics3d.gaussians.render import render
 from physics3d.log import Log
 from physics3d.scenes.base import Capture
+
+FLOATER_VIEWS = 32  # photographs asked whether they need a Gaussian that stands apart
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,7 +26,9 @@ class Reconstruct:
     longest_side: int = 320  # photographs are reduced to this [px]
     ssim_weight: float = 0.2
     rates: Rates = field(default_factory=Rates)
-    densify_every: int = 100  # iterations between additions and removals of Gaussians
+    densification: AbstractDensification = field(default_factory=Adaptive)  # where Gaussians are added and removed
+    exposure: bool = False  # learn a gain and an offset per photograph and channel; those held out get none
+    floaters: float | None = 3.0  # see gaussians/floaters.py [standard deviations]; null: keep them
     check_every: int = 250  # iterations between looks at the held-out photographs
     patience: int = 3  # checks without improvement before it stops early
     seed: int = 0
@@ -56,13 +62,16 @@ class Reconstruct:
             max_gaussians=self.max_gaussians,
             ssim_weight=self.ssim_weight,
             rates=self.rates,
-            densify_every=self.densify_every,
+            exposure=self.exposure,
+            densification=self.densification,
             check_every=self.check_every,
             patience=self.patience,
             seed=self.seed,
             log=log,
             preview=preview,
         )
+        if self.floaters is not None and (capture.alphas or capture.single_object):
+            gaussians = self.without_floaters(gaussians, training, held_out or training, background, log)
         if held_out:
             value = held_out_psnr(gaussians, held_out, background)
             log.metric("psnr_held_out", value)
@@ -73,15 +82,32 @@ class Reconstruct:
         return gaussians
 
     def check(self) -> None:
-        for name in ("iterations", "max_gaussians", "densify_every", "check_every", "patience"):
+        for name in ("iterations", "max_gaussians", "check_every", "patience"):
             if getattr(self, name) < 1:
                 raise ValueError(f"reconstruct.{name} is {getattr(self, name)}; it must be at least 1")
+        if self.densification.every < 1:
+            raise ValueError(f"reconstruct.densification.every is {self.densification.every}; it must be at least 1")
+        if self.floaters is not None and not self.floaters > 0:
+            raise ValueError(f"reconstruct.floaters is {self.floaters}; it must be positive, 3 is usual, or null")
         if self.longest_side < 16:
             raise ValueError(f"reconstruct.longest_side is {self.longest_side} px; it must be at least 16")
         if self.sh_degree not in (0, 1, 2, 3):
             raise ValueError(f"reconstruct.sh_degree is {self.sh_degree}; it must be 0, 1, 2 or 3")
         if not 0 <= self.ssim_weight <= 1:
             raise ValueError(f"reconstruct.ssim_weight is {self.ssim_weight}; it must lie in 0..1")
+
+    def without_floaters(
+        self, gaussians: Gaussians, training: list[Photograph], views: list[Photograph], background, log: Log
+    ) -> Gaussians:
+        """Of one object alone: what hangs in the air around it would become particles."""
+        spread = training[:: max(1, len(training) // FLOATER_VIEWS)]
+        alone = floaters(gaussians, [p.camera for p in spread], deviations=self.floaters or 0)
+        rest = gaussians.select(~alone.to(gaussians.mean.device))
+        change = held_out_psnr(rest, views, background) - held_out_psnr(gaussians, views, background)
+        log.metric("floaters", int(alone.sum()))
+        log.metric("psnr_without_floaters_minus_with", change)
+        log.info(f"{int(alone.sum())} floating Gaussians removed, which changes the PSNR by {change:+.3f} dB")
+        return rest
 
     def photographs(self, capture: Capture) -> list[Photograph]:
         """All photographs in floating point, reduced, multiplied by their matte where there is one."""

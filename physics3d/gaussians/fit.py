@@ -1,33 +1,37 @@
 """Photographs -> Gaussians: gradient descent on appearance, with Gaussians added where the pictures are wrong.
 
-    loss = (1 - s) |image - photograph|_1 + s (1 - SSIM) + 0.01 mean opacity,   s = `ssim_weight`
+    loss = (1 - s) |image - photograph|_1 + s (1 - SSIM) + a |alpha - matte|_1 + the densification's penalty
 
-Kerbl et al. (2023) split Gaussians by the gradient of their position; here, as in Rota Bulo et al. (2024), by the error
-of the pixels they draw: e_i = sum over pixels of (blending weight x absolute error), which is what `contribution`
-returns for an error image. Transparent Gaussians are removed, the count grows to a cap, and the early part runs at half
-resolution. Photographs with a matte are composited on random colours, so that empty space becomes transparent.
+s = `ssim_weight`, a = `MATTE_WEIGHT` where there are mattes, which makes empty space transparent. The count grows to a
+cap (`densify.py` says how). The early part runs at a quarter and half resolution, and colour starts to depend on the
+viewing direction degree by degree. Photographs may differ in exposure: image_i = g_i colour + b_i per channel, learned
+beside the Gaussians, with the means over the photographs held at ln g = 0, b = 0.
 """
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from physics3d.gaussians.cameras import Camera
+from physics3d.gaussians.densify import AbstractDensification, Moments
 from physics3d.gaussians.model import FIELDS, Gaussians
-from physics3d.gaussians.rasterize import NEAR, contribution
+from physics3d.gaussians.rasterize import NEAR, Rendered, contribution
 from physics3d.gaussians.render import render
 from physics3d.gaussians.sh import C0
 from physics3d.gaussians.ssim import ssim
 
-OPACITY_WEIGHT = 0.01  # of the mean opacity, in the loss: Gaussians that do not help fade, and are then removed
-FADED = 0.02  # opacity below which a Gaussian is removed
+MATTE_WEIGHT = 0.2  # of the error in alpha, in the loss
 SCORED_VIEWS = 8  # photographs looked at to decide where Gaussians are missing
 GROWTH = (0.05, 0.7)  # part of the iterations during which Gaussians are added and removed
-COARSE = 0.35  # part of the iterations, at the start, at half resolution
+COARSE = ((0.1, 0.25), (0.35, 0.5))  # until which part of the iterations, at what share of the resolution
+LEAST_SIDE = 80  # photographs are not reduced below this [px]
+SH_WARM_UP = 0.3  # part of the iterations after which all degrees of the harmonics are learned
+BETTER = 0.05  # gain of PSNR that counts as improvement [dB]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,10 +60,11 @@ class Rates:
     """Step sizes of Adam at the start; they fall to `final` of it, exponentially."""
 
     mean: float = 1e-3  # times the extent of the scene
-    log_scale: float = 1e-2
-    quaternion: float = 4e-3
+    log_scale: float = 8e-2
+    quaternion: float = 2e-2
     opacity_logit: float = 5e-2
     sh: float = 1e-2  # degree 0; the higher ones learn 10 times slower
+    exposure: float = 1e-2  # of a photograph, where exposures are learned
     final: float = 0.05
 
 
@@ -95,9 +100,10 @@ def from_points(points: Tensor, colors: Tensor, *, sh_degree: int) -> Gaussians:
 
 
 def random_points(photographs: list[Photograph], count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Points [count, 3] [m] that most cameras see, inside every matte, and their mean colours [count, 3].
+    """Up to `count` points [m, 3] [m] that most cameras see, inside every matte, and their mean colours [m, 3].
 
-    Drawn around the point nearest to all optical axes. Raises ValueError if the cameras see nothing in common.
+    Drawn around the point nearest to all optical axes, in a box that shrinks to what is seen in common. Raises
+    ValueError if the cameras see nothing in common.
     """
     picks = torch.linspace(0, len(photographs) - 1, min(24, len(photographs))).round().long().tolist()
     views = [photographs[i] for i in picks]
@@ -106,32 +112,37 @@ def random_points(photographs: list[Photograph], count: int, generator: torch.Ge
     across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
     middle = torch.linalg.lstsq(across.sum(0), (across @ centres[..., None]).sum(0)).solution[:, 0]
     reach = (centres - middle).norm(dim=-1).median()
-    points, colors, enough = [], [], False
+    lower, upper = middle - reach, middle + reach
+    points, colors = torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, 3)
     for _ in range(40):
-        tried = middle + reach * (2 * torch.rand(50_000, 3, generator=generator, dtype=torch.float64) - 1)
-        seen, inside, color = (
-            torch.zeros(len(tried)),
-            torch.ones(len(tried), dtype=torch.bool),
-            torch.zeros(len(tried), 3),
-        )
-        for p in views:
-            uv, z = p.camera.project(tried)
-            u, v = uv.floor().long().unbind(-1)
-            visible = (z > NEAR) & (u >= 0) & (u < p.camera.width) & (v >= 0) & (v < p.camera.height)
-            u, v = u[visible], v[visible]
-            seen[visible] += 1
-            color[visible] += p.color[v, u]
-            if p.alpha is not None:
-                inside[visible] &= p.alpha[v, u] > 0.1
-        keep = inside & (seen >= 0.6 * len(views))
-        points.append(tried[keep])
-        colors.append(color[keep] / seen[keep, None])
-        enough = sum(map(len, points)) >= count
-        if enough:
+        tried = lower + (upper - lower) * torch.rand(50_000, 3, generator=generator, dtype=torch.float64)
+        keep, color = _seen_in_common(tried, views)
+        points, colors = torch.cat([points, tried[keep]]), torch.cat([colors, color[keep]])
+        if len(points) >= count:
             break
-    if not sum(map(len, points)):
+        if len(points) >= 10:
+            margin = 0.2 * (points.amax(0) - points.amin(0))
+            lower = torch.maximum(lower, points.amin(0) - margin)
+            upper = torch.minimum(upper, points.amax(0) + margin)
+    if not len(points):
         raise ValueError("the cameras see no common space; check the poses, or give the capture points")
-    return torch.cat(points)[:count].float(), torch.cat(colors)[:count]
+    return points[:count].float(), colors[:count]
+
+
+def _seen_in_common(points: Float[Tensor, "m 3"], views: list[Photograph]) -> tuple[Tensor, Float[Tensor, "m 3"]]:
+    """Which points six tenths of the views see, and none sees outside its matte; the mean colour they are seen in."""
+    seen, inside = torch.zeros(len(points)), torch.ones(len(points), dtype=torch.bool)
+    color = torch.zeros(len(points), 3)
+    for p in views:
+        uv, z = p.camera.project(points)
+        u, v = uv.floor().long().unbind(-1)
+        visible = (z > NEAR) & (u >= 0) & (u < p.camera.width) & (v >= 0) & (v < p.camera.height)
+        u, v = u[visible], v[visible]
+        seen[visible] += 1
+        color[visible] += p.color[v, u]
+        if p.alpha is not None:
+            inside[visible] &= p.alpha[v, u] > 0.1
+    return inside & (seen >= 0.6 * len(views)), color / seen.clamp_min(1)[:, None]
 
 
 def background_points(
@@ -157,6 +168,30 @@ def background_points(
     return (torch.cat(found).float(), torch.cat(colors)) if found else (points[:0].float(), torch.zeros(0, 3))
 
 
+class Exposure:
+    """Gain and offset per photograph and channel [photographs, 3], and one step of Adam on those of one photograph."""
+
+    def __init__(self, count: int, device: torch.device):
+        self.values = torch.zeros(2, count, 3, device=device)  # ln of the gain, offset
+        self.mean, self.square = torch.zeros_like(self.values), torch.zeros_like(self.values)
+
+    def of(self, i: int) -> Float[Tensor, "2 3"]:
+        return self.values[:, i].clone().requires_grad_()
+
+    @staticmethod
+    def applied(drawn: Rendered, values: Float[Tensor, "2 3"], behind: Float[Tensor, " 3"]) -> Float[Tensor, "h w 3"]:
+        """The background is not part of the photograph: it keeps its colour."""
+        beside = (1 - drawn.alpha)[..., None] * behind
+        return torch.exp(values[0]) * (drawn.color - beside) + values[1] * drawn.alpha[..., None] + beside
+
+    def step(self, i: int, gradient: Float[Tensor, "2 3"], size: float) -> None:
+        # each photograph comes by rarely: its second moment forgets faster than the Gaussians'
+        self.mean[:, i].lerp_(gradient, 0.2)
+        self.square[:, i].lerp_(gradient.square(), 0.05)
+        self.values[:, i] -= size * self.mean[:, i] / (self.square[:, i].sqrt() + 1e-12)
+        self.values -= self.values.mean(1, keepdim=True)
+
+
 def fit(
     start: Gaussians,
     photographs: list[Photograph],
@@ -165,25 +200,30 @@ def fit(
     background: Float[Tensor, " 3"],
     iterations: int,
     max_gaussians: int,
+    densification: AbstractDensification,
     ssim_weight: float,
     rates: Rates,
-    densify_every: int,
+    exposure: bool,
     check_every: int,
     patience: int,
     seed: int,
     log,
     preview: Callable[[Gaussians, int], None],
 ) -> Gaussians:
-    """Fit `start` to the photographs. Stops early when `patience` checks of the held-out PSNR bring less than 0.05 dB.
+    """Fit `start` to the photographs. Stops early when `patience` checks in a row bring less than 0.05 dB.
 
-    `preview` is called at every check with the model and the iteration. Same seed, same machine: same result (CPU).
+    A check is the PSNR of the photographs held out, or, with none, the running mean over the training ones. `preview`
+    is called at every check with the model and the iteration. Same seed, same machine: same result (CPU).
     """
     generator = torch.Generator().manual_seed(seed)
     device = photographs[0].color.device
     centres = torch.stack([p.camera.centre for p in photographs])
     extent = float((centres - centres.mean(0)).norm(dim=-1).max()) * 1.1
-    coarse = [p.scaled(0.5) for p in photographs]
-    model, moments, first = start.to(device, torch.float32), {}, len(start)  # type: ignore[var-annotated]
+    coarse = {factor: _reduced(photographs, factor) for _, factor in COARSE}
+    model, first = start.to(device, torch.float32), len(start)
+    moments: Moments = {}
+    lenses = Exposure(len(photographs), device) if exposure else None
+    degrees = round(math.sqrt(start.sh.shape[1]))  # how many, with degree 0
     queue: list[int] = []
     best, stale, recent = -math.inf, 0, float("nan")
 
@@ -191,47 +231,73 @@ def fit(
     for step in steps:
         if not queue:
             queue = torch.randperm(len(photographs), generator=generator).tolist()
-        small = step < COARSE * iterations and min(coarse[0].color.shape[:2]) >= 32
-        photograph = (coarse if small else photographs)[queue.pop()]
-        behind = background if photograph.alpha is None else torch.rand(3, generator=generator).to(device)
+        which, done = queue.pop(), step / iterations
+        level = next((coarse[factor] for until, factor in COARSE if done < until), photographs)
+        photograph = level[which]
 
         model = replace(model, **{name: getattr(model, name).detach().requires_grad_() for name in FIELDS})
-        image, truth = render(model, photograph.camera, background=behind).color, photograph.on(behind)
-        loss = (1 - ssim_weight) * (image - truth).abs().mean() + OPACITY_WEIGHT * model.opacity.mean()
+        known = min(degrees, 1 + int(degrees * done / SH_WARM_UP)) ** 2
+        drawn = render(replace(model, sh=model.sh[:, :known]), photograph.camera, background=background)
+        image, truth = drawn.color, photograph.on(background)
+        if lenses is not None:
+            values = lenses.of(which)
+            image = lenses.applied(drawn, values, background)
+        loss = (1 - ssim_weight) * (image - truth).abs().mean() + densification.penalty(model, extent)
         if ssim_weight > 0:
             loss = loss + ssim_weight * (1 - ssim(image, truth))
+        if photograph.alpha is not None:
+            loss = loss + MATTE_WEIGHT * (drawn.alpha - photograph.alpha).abs().mean()
         loss.backward()
-        model = _adam(model, moments, rates, extent, step, iterations)
+        fall = rates.final**done
+        model = _adam(model, moments, rates, extent, step, fall)
+        model = densification.stirred(model, fall * rates.mean / extent, generator)
+        if lenses is not None:
+            lenses.step(which, values.grad, fall * rates.exposure)  # type: ignore[arg-type]
         value = psnr(image.detach(), truth)
         recent = value if math.isnan(recent) else 0.95 * recent + 0.05 * value
         steps.set_postfix(psnr=f"{recent:.1f} dB", gaussians=str(len(model)), refresh=False)
 
         done = (step + 1) / iterations
-        if (step + 1) % densify_every == 0 and GROWTH[0] <= done <= GROWTH[1]:
+        if (step + 1) % densification.every == 0 and GROWTH[0] <= done <= GROWTH[1]:
             part = (done - GROWTH[0]) / (GROWTH[1] - GROWTH[0])
             wanted = round(first + (max_gaussians - first) * min(1.0, 1.25 * part))
             picks = torch.randperm(len(photographs), generator=generator)[:SCORED_VIEWS].tolist()
-            views = [(coarse if small else photographs)[i] for i in picks]
-            model = _renew(model, moments, views, background, wanted)
+            views = [level[i] for i in picks]
+            error = partial(drawn_error, model, views, background)
+            model = densification.renewed(model, moments, error, wanted, generator)
         if (step + 1) % check_every == 0 or step + 1 == iterations:
+            now = held_out_psnr(model, held_out, background) if held_out else recent
             log.metric("psnr_train", recent, step + 1)
             log.metric("gaussians", len(model), step + 1)
             if held_out:
-                now = held_out_psnr(model, held_out, background)
                 log.metric("psnr_held_out", now, step + 1)
-                stale = 0 if now > best + 0.05 else stale + 1
-                best = max(best, now)
+            stale = 0 if now > best + BETTER else stale + 1
+            best = max(best, now)
             preview(model, step + 1)
             if stale >= patience and done > GROWTH[1]:
-                log.info(f"held-out PSNR no longer improves after {step + 1} iterations")
+                kind = "held-out" if held_out else "training"
+                log.info(f"{kind} PSNR no longer improves after {step + 1} iterations")
                 break
     steps.close()
     return model
 
 
-def _adam(model: Gaussians, moments: dict, rates: Rates, extent: float, step: int, iterations: int) -> Gaussians:
+def drawn_error(model: Gaussians, views: list[Photograph], background: Float[Tensor, " 3"]) -> Float[Tensor, " n"]:
+    """Error that each Gaussian draws in the view where it is largest: sum of blending weight x absolute error [px]."""
+    error = torch.zeros(len(model), device=model.mean.device)
+    for p in views:
+        wrong = (render(model, p.camera, background=background).color - p.on(background)).abs().mean(-1)
+        error = torch.maximum(error, contribution(model, p.camera, wrong[None])[:, 0])
+    return error
+
+
+def _reduced(photographs: list[Photograph], factor: float) -> list[Photograph]:
+    factor = max(factor, LEAST_SIDE / min(min(p.color.shape[:2]) for p in photographs))
+    return photographs if factor >= 1 else [p.scaled(factor) for p in photographs]
+
+
+def _adam(model: Gaussians, moments: Moments, rates: Rates, extent: float, step: int, fall: float) -> Gaussians:
     """One step of Adam (0.9, 0.999) on every field; `moments` are kept beside the fields so that they follow splits."""
-    fall = rates.final ** (step / iterations)
     new = {}
     with torch.no_grad():
         for name in FIELDS:
@@ -247,31 +313,3 @@ def _adam(model: Gaussians, moments: dict, rates: Rates, extent: float, step: in
                 change[:, 1:] *= 0.1
             new[name] = value - change
     return replace(model, **new)
-
-
-def _renew(model: Gaussians, moments: dict, views: list[Photograph], background: Tensor, wanted: int) -> Gaussians:
-    """Remove faded Gaussians and split those that draw the most error in two, until there are `wanted`."""
-    with torch.no_grad():
-        error = torch.zeros(len(model), device=model.mean.device)
-        for p in views:
-            wrong = (render(model, p.camera, background=background).color - p.on(background)).abs().mean(-1)
-            error = torch.maximum(error, contribution(model, p.camera, wrong[None])[:, 0])
-        keep = torch.nonzero(model.opacity > FADED)[:, 0]
-        if len(keep) == 0:
-            raise ValueError("every Gaussian faded away; check the photographs' cameras, or give the capture points")
-        count = max(0, min(wanted - len(keep), len(keep)))
-        split = torch.zeros(len(model), dtype=torch.bool, device=keep.device)
-        split[keep[torch.topk(error[keep], count).indices]] = True
-        model, parents = model.select(torch.cat([keep, torch.nonzero(split)[:, 0]])), split[keep]
-        twin = torch.cat([parents, torch.ones(count, dtype=torch.bool, device=keep.device)])
-        side = torch.ones(len(model), device=keep.device)
-        side[len(keep) :] = -1
-        # two halves of the longest axis: centres 0.5 sigma from the middle, 0.6 times as long, 0.85 times as thick
-        longest = torch.nn.functional.one_hot(model.log_scale.argmax(-1), 3).to(model.mean)
-        axis = torch.einsum("nij,nj->ni", model.rotation(), longest * torch.exp(model.log_scale))
-        thinner = math.log(0.85) + (math.log(0.6) - math.log(0.85)) * longest
-        mean = torch.where(twin[:, None], model.mean + 0.5 * side[:, None] * axis, model.mean)
-        log_scale = torch.where(twin[:, None], model.log_scale + thinner, model.log_scale)
-        for name, pair in moments.items():
-            moments[name] = tuple(torch.cat([a[keep], torch.zeros_like(a[:count])]) for a in pair)
-    return replace(model, mean=mean, log_scale=log_scale)

@@ -1,0 +1,42 @@
+"""Floaters: Gaussians that hang alone in the air, where few photographs contradict them.
+
+A Gaussian floats if its mean distance to its nearest neighbours is more than `deviations` standard deviations above the
+average of all (Open3D's statistical outlier removal, Rusu et al. 2008), and if no photograph needs it: the sum of its
+blending weights is less than `DRAWN` pixels in each. A filled body would have a particle there. Large ones on plain
+surfaces are far from their neighbours as well, but they are drawn.
+"""
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from physics3d.gaussians.cameras import Camera
+from physics3d.gaussians.model import Gaussians
+from physics3d.gaussians.rasterize import contribution
+from physics3d.open3d_import import open3d
+
+NEIGHBOURS = 20
+DRAWN = 5.0  # [px]
+VISIBLE = 1 / 255  # opacity below which a Gaussian is never drawn
+
+
+def floaters(gaussians: Gaussians, cameras: list[Camera], *, deviations: float) -> Bool[Tensor, " n"]:
+    """Which Gaussians float, as the cameras see them; those too faint to be drawn count as floating.
+
+    Raises ValueError unless `deviations` > 0.
+    """
+    if not deviations > 0:
+        raise ValueError(f"floaters: deviations is {deviations}; it must be positive, e.g. 3")
+    drawn = torch.nonzero(gaussians.opacity.cpu() >= VISIBLE)[:, 0]
+    alone = torch.ones(len(gaussians), dtype=torch.bool)
+    if len(drawn) <= NEIGHBOURS:
+        alone[drawn] = False
+        return alone
+    o3d = open3d()
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(gaussians.mean.detach().cpu()[drawn].double().numpy()))
+    _, kept = cloud.remove_statistical_outlier(NEIGHBOURS, deviations)
+    alone[drawn[torch.tensor(kept, dtype=torch.long)]] = False
+    for camera in cameras if alone.any() else ():
+        everywhere = torch.ones(1, camera.height, camera.width, device=gaussians.mean.device)
+        alone &= contribution(gaussians, camera, everywhere)[:, 0].cpu() < DRAWN
+    return alone
