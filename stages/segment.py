@@ -36,6 +36,7 @@ class Segment:
     masker: AbstractMasker = field(default_factory=GrabCut)
     views: int = 16  # photographs that are masked, spread around the object
     size: int = 480  # longer side of the photographs as they are masked [px]
+    rounds: int = 2  # of masking every photograph again, by what all together say
     device: str = "cpu"
 
     def __call__(self, capture: Capture, gaussians: Gaussians, *, log: Log) -> Segmentation:
@@ -50,8 +51,8 @@ class Segment:
             every = self._views(capture, gaussians, said, rooms, log)
             views, maps = self._maps(capture, every, parts, said, rooms, log)
             label = self._lift(gaussians, views, maps, parts, rooms)
-            if self.prompts:
-                views, maps = every, self._refine(gaussians, label, every, parts, said, rooms, capture, log)
+            for _ in range(self.rounds if self.prompts else 0):
+                views, maps = every, self._refine(gaussians, label, every, parts, rooms, capture, log)
                 label = self._lift(gaussians, views, maps, parts, rooms)
             log.image("masks", contact_sheet([tinted(v.image, m.numpy()) for v, m in zip(views, maps)]))
             gaussians = gaussians.to("cpu")
@@ -153,30 +154,29 @@ class Segment:
         return label
 
     def _refine(
-        self, gaussians, label, views: list[View], parts: tuple[str, ...], said, rooms, capture: Capture, log: Log
+        self, gaussians, label, views: list[View], parts: tuple[str, ...], rooms, capture: Capture, log: Log
     ) -> list[torch.Tensor]:
-        """Maps again, each view now prompted by what all views together say; what a person prompted stays."""
+        """Maps again, each view now masked by what all views together say."""
         maps = []
         for view in log.progress(views, "refining masks"):
+            shares = self._shares(gaussians, label, len(parts), view)
             masks = []
-            for k, part in enumerate(parts, 1):
-                if part in said and said[part][0].index == view.index:
-                    masks.append(said[part][1])
-                    continue
-                one = (label == k).to(gaussians.mean)[:, None].expand(-1, 3)
-                with torch.no_grad():
-                    drawn = rasterize(
-                        gaussians.mean,
-                        gaussians.covariance(),
-                        gaussians.opacity,
-                        one,
-                        view.camera,
-                        background=(0, 0, 0),
-                    )
-                mask = refined_mask(drawn.color[..., 0].cpu().numpy(), view, self.masker)
-                masks.append(mask & ~rooms[part].excludes(view) if part in rooms else mask)
+            for part, share in zip(parts, shares):
+                mask = refined_mask(share, view, rooms.get(part), self.masker)
+                # where two parts meet, both outlines are guesses: a pixel is of the one that shows there
+                masks.append(mask & (share >= shares.max(0) - 1e-6) if len(parts) > 1 else mask)
             maps.append(_labelled(masks, view, capture))
         return maps
+
+    def _shares(self, gaussians: Gaussians, label: torch.Tensor, count: int, view: View) -> np.ndarray:
+        """Share of each pixel that the Gaussians of each label 1..count contribute, [count, h, w]."""
+        shape, shares = gaussians.covariance(), []
+        one_hot = torch.nn.functional.one_hot(label.long(), 1 + -(-count // 3) * 3)[:, 1:].to(gaussians.mean)
+        for three in one_hot.split(3, 1):
+            with torch.no_grad():
+                drawn = rasterize(gaussians.mean, shape, gaussians.opacity, three, view.camera, background=(0, 0, 0))
+            shares.append(drawn.color.permute(2, 0, 1).cpu())
+        return torch.cat(shares)[:count].numpy()
 
     def _views(self, capture: Capture, gaussians: Gaussians, said, rooms: dict[str, Room], log: Log) -> list[View]:
         """The prompted views, and training photographs that show the parts whole, spread by farthest camera."""

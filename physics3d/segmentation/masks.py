@@ -2,17 +2,26 @@
 
 Rother, Kolmogorov, Blake (2004), "GrabCut"; Ravi et al. (2024), "SAM 2". Pixel coordinates are (u, v), from the upper
 left corner of the image, pixel centres at integer + 0.5.
+
+A masker answers two questions: what a person points at (the call), and what the object is, given what other views
+say of every pixel (`refine`). One that also follows a mask through a video has `follow`.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 
 from physics3d.priors.weights import hub_answers
+from physics3d.segmentation.pixels import bounds, centres, depth_in, eroded, thinned
+
+SURE = 0.95  # share of a pixel above which it is the object's, and 1 - SURE below which it is not
 
 
 class AbstractMasker:
@@ -28,6 +37,20 @@ class AbstractMasker:
         positive: Float[np.ndarray, "p 2"],  # points on the object [px]
         negative: Float[np.ndarray, "q 2"],  # points beside it [px]
     ) -> Bool[np.ndarray, "h w"]:
+        raise NotImplementedError
+
+    def refine(self, image: UInt8[np.ndarray, "h w 3"], share: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+        """The mask, where `share` (0..1) of each pixel is the object's by a guess that is right but not sharp."""
+        raise NotImplementedError
+
+
+class AbstractVideoMasker(AbstractMasker):
+    """A masker that can also carry a mask from one picture of a sequence to all others."""
+
+    def follow(
+        self, images: Sequence[UInt8[np.ndarray, "h w 3"]], start: int, mask: Bool[np.ndarray, "h w"]
+    ) -> list[Bool[np.ndarray, "h w"]]:
+        """Masks of pictures that follow each other along a path, from that of picture `start`."""
         raise NotImplementedError
 
 
@@ -61,17 +84,41 @@ class GrabCut(AbstractMasker):
         for points, value in ((positive, cv2.GC_FGD), (negative, cv2.GC_BGD)):
             for u, v in np.floor(points).astype(int).tolist():
                 cv2.circle(kinds, (u, v), reach, value, -1)
-        guess = kinds[near].copy()
-        is_object = lambda: np.isin(guess, (cv2.GC_FGD, cv2.GC_PR_FGD))
-        # without any object or any surroundings there is no colour model to learn
-        if is_object().any() and not is_object().all():
-            cv2.setRNGSeed(0)
-            models, pixels = (np.zeros((1, 65)), np.zeros((1, 65))), np.ascontiguousarray(image[near][..., ::-1])
-            cv2.grabCut(pixels, guess, None, *models, self.iterations, cv2.GC_INIT_WITH_MASK)  # type: ignore[call-overload]
-        mask = np.zeros((height, width), np.uint8)
-        mask[near] = is_object()
-        closed = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+        mask = cut(image, kinds, near, self.iterations)
+        closed = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
         return without_specks(connected_to(closed.astype(bool), positive))
+
+    def refine(self, image, share):
+        """The outline is cut in a band about the guess, an eighth of the object wide, so that thin things return."""
+        import cv2
+
+        guess = share > 0.5
+        if not guess.any():
+            return guess
+        kinds = np.where(guess, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
+        kinds[(share > SURE) & (depth_in(guess) > 2)] = cv2.GC_FGD
+        kinds[(share < 1 - SURE) & (depth_in(~guess) > max(4, 0.12 * guess.sum() ** 0.5))] = cv2.GC_BGD
+        left, top, right, bottom = bounds(centres(guess), 0.5, guess.shape, share=1.0).astype(int)
+        mask = cut(image, kinds, (slice(top, bottom), slice(left, right)), self.iterations)
+        return mask | (without_specks(mask) & guess)
+
+
+def cut(
+    image: UInt8[np.ndarray, "h w 3"], kinds: UInt8[np.ndarray, "h w"], near: tuple[slice, slice], iterations: int
+) -> Bool[np.ndarray, "h w"]:
+    """The object by GrabCut in a part of the image; `kinds` are OpenCV's four classes of pixels."""
+    import cv2
+
+    guess = kinds[near].copy()
+    is_object = lambda: np.isin(guess, (cv2.GC_FGD, cv2.GC_PR_FGD))
+    # without any object or any surroundings there is no colour model to learn
+    if is_object().any() and not is_object().all():
+        cv2.setRNGSeed(0)
+        models, pixels = (np.zeros((1, 65)), np.zeros((1, 65))), np.ascontiguousarray(image[near][..., ::-1])
+        cv2.grabCut(pixels, guess, None, *models, iterations, cv2.GC_INIT_WITH_MASK)  # type: ignore[call-overload]
+    mask = np.zeros(kinds.shape, bool)
+    mask[near] = is_object()
+    return mask
 
 
 def connected_to(mask: Bool[np.ndarray, "h w"], positive: Float[np.ndarray, "p 2"]) -> Bool[np.ndarray, "h w"]:
@@ -117,6 +164,21 @@ class Sam2(AbstractMasker):
     device: str = "cpu"
 
     def __call__(self, image, *, box, positive, negative):
+        return self._predict(image, box, positive, negative, None)
+
+    def refine(self, image, share):
+        guess = share > 0.5
+        if not guess.any():
+            return guess
+        band = guess.sum() ** 0.5
+        positive = centres(eroded(share > SURE, 0.02 * band))
+        negative = centres(eroded(share < 1 - SURE, 2 + 0.05 * band))
+        box = bounds(centres(guess), 0.05, guess.shape, share=1.0)
+        return self._predict(
+            image, box, thinned(positive, self.most_points), thinned(negative, self.most_points), share
+        )
+
+    def _predict(self, image, box, positive, negative, share):
         with torch.no_grad():
             self.predictor.set_image(np.ascontiguousarray(image))
             points = np.concatenate([positive, negative]).astype(np.float32)
@@ -125,14 +187,22 @@ class Sam2(AbstractMasker):
                 point_coords=points if len(points) else None,
                 point_labels=signs if len(points) else None,
                 box=None if box is None else np.asarray(box, np.float32),
+                mask_input=None if share is None else self._logits(share),
                 # one click is ambiguous: take the candidate that the network itself trusts most
                 multimask_output=box is None and len(points) == 1,
             )
         return masks[int(np.argmax(scores))].astype(bool)
 
+    def _logits(self, share: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "1 a a"]:
+        """The guess as the network takes an earlier answer of its own: a quarter of its image, -10 to 10."""
+        import cv2
+
+        side = self.image_size // 4
+        return (20 * cv2.resize(share.astype(np.float32), (side, side), interpolation=cv2.INTER_AREA) - 10)[None]
+
     @cached_property
-    def predictor(self):
-        """Raises ValueError naming segment.masker.config or segment.masker.weights."""
+    def model(self) -> Any:
+        """The network of both predictors. Raises ValueError naming segment.masker.config or segment.masker.weights."""
         model = build_sam2(self.config, self.image_size)
         state = torch.load(sam2_weights(self.weights), map_location="cpu", weights_only=True)
         missing, unexpected = model.load_state_dict(state.get("model", state), strict=False)
@@ -141,11 +211,48 @@ class Sam2(AbstractMasker):
                 f"segment.masker.weights={self.weights} does not fit segment.masker.config={self.config} "
                 f"({len(missing)} entries missing, {len(unexpected)} unexpected); choose the pair of one model"
             )
+        return model.to(self.device).eval()
+
+    @cached_property
+    def predictor(self):
         from sam2.sam2_image_predictor import SAM2ImagePredictor
 
-        predictor = SAM2ImagePredictor(model.to(self.device).eval())
+        predictor = SAM2ImagePredictor(self.model)
         predictor._bb_feat_sizes = [(self.image_size // k,) * 2 for k in (4, 8, 16)]  # written for 1024 px there
         return predictor
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sam2Video(AbstractVideoMasker):
+    """SAM 2's video predictor: what a person prompts in one photograph is followed along the path of the cameras."""
+
+    still: Sam2 = field(default_factory=Sam2)  # for the prompted photograph, and to refine; the weights serve both
+
+    @property
+    def most_points(self) -> int:  # type: ignore[override]
+        return self.still.most_points
+
+    def __call__(self, image, *, box, positive, negative):
+        return self.still(image, box=box, positive=positive, negative=negative)
+
+    def refine(self, image, share):
+        return self.still.refine(image, share)
+
+    def follow(self, images, start, mask):
+        import cv2
+
+        with TemporaryDirectory() as folder:  # it reads frames from files only
+            for i, image in enumerate(images):
+                cv2.imwrite(f"{folder}/{i}.jpg", image[..., ::-1], (cv2.IMWRITE_JPEG_QUALITY, 97))
+            state = self.still.model.init_state(folder)
+        self.still.model.add_new_mask(state, start, 1, mask)
+        found: dict[int, np.ndarray] = {}
+        for backwards in (False, True):
+            for i, _, logits in self.still.model.propagate_in_video(state, start, reverse=backwards):
+                size = images[i].shape[1::-1]
+                found[i] = cv2.resize(logits[0, 0].float().cpu().numpy(), size, interpolation=cv2.INTER_LINEAR) > 0
+        found[start] = mask
+        return [found[i] for i in range(len(images))]
 
 
 def build_sam2(config: str, image_size: int) -> torch.nn.Module:
@@ -171,6 +278,8 @@ def build_sam2(config: str, image_size: int) -> torch.nn.Module:
         raise ValueError(f"segment.masker.image_size={image_size} must be a positive multiple of 32, 1024 as trained")
     tree = OmegaConf.load(file)
     tree.model.image_size = image_size
+    # a subclass that adds nothing to the network: it serves the image predictor as well
+    tree.model._target_ = "sam2.sam2_video_predictor.SAM2VideoPredictor"
     return instantiate(tree.model, _recursive_=True)
 
 

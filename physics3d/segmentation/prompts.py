@@ -17,10 +17,12 @@ from torch import Tensor
 from physics3d.gaussians.cameras import Camera
 from physics3d.gaussians.rasterize import Rendered
 from physics3d.log import Log
-from physics3d.segmentation.masks import AbstractMasker
+from physics3d.segmentation.masks import AbstractMasker, AbstractVideoMasker
+from physics3d.segmentation.pixels import bounds, centres, eroded, share_within, thinned
 
 DEPTH_TOLERANCE = 0.03  # of the depth: farther behind the rendered surface a point is hidden
 MOST_CARRIED = 20_000  # points of each sign
+LEAST_REFINED = 20  # pixels; a part that shows less in a view is not looked for there
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,6 +200,11 @@ def carry_masks(
     masks = {first.index: mask}
     inside, outside = first.points(eroded(mask, 2)), first.points(eroded(~mask, 2))
     inside, outside = thinned(inside, MOST_CARRIED), thinned(outside, MOST_CARRIED)
+    followed: dict[int, np.ndarray] = {}
+    if isinstance(masker, AbstractVideoMasker):
+        path = along_path(first, views)
+        start = next(k for k, v in enumerate(path) if v.index == first.index)
+        followed = dict(zip([v.index for v in path], masker.follow([v.image for v in path], start, mask)))
     towards = lambda view: torch.nn.functional.normalize(view.camera.centre.to(room.centre) - room.centre, dim=0)
     order = sorted((v for v in views if v.index != first.index), key=lambda v: -float(towards(v) @ towards(first)))
     for view in log.progress(order, "carrying the prompt"):
@@ -206,19 +213,22 @@ def carry_masks(
             log.info(f"{view.name} hardly shows the object, left out")
             continue
         # the side that no view has shown yet may stick out
-        box = bounds(uv[seen], 0.3, view)
+        box = bounds(uv[seen], 0.3, view.image.shape)
         around, clear = view.sees(outside)
         clear &= ((around >= box[:2]) & (around <= box[2:])).all(1)
         beyond = room.excludes(view)
-        pixels = np.argwhere(beyond)[:, ::-1] + 0.5
-        pixels = pixels[((pixels >= box[:2]) & (pixels <= box[2:])).all(1)]
-        found = masker(
-            view.image,
-            box=box,
-            positive=thinned(uv[seen], masker.most_points),
-            negative=np.concatenate([thinned(p, masker.most_points // 2) for p in (around[clear], pixels)]),
-        )
-        found &= ~beyond
+        if view.index in followed:
+            found = followed[view.index] & ~beyond
+        else:
+            pixels = centres(beyond)
+            pixels = pixels[((pixels >= box[:2]) & (pixels <= box[2:])).all(1)]
+            found = masker(
+                view.image,
+                box=box,
+                positive=thinned(uv[seen], masker.most_points),
+                negative=np.concatenate([thinned(p, masker.most_points // 2) for p in (around[clear], pixels)]),
+            )
+            found &= ~beyond
         recall, leak = share_within(found, uv[seen]), share_within(found, around[clear])
         if recall < 0.6 or leak > 0.3:
             log.info(
@@ -234,22 +244,36 @@ def carry_masks(
     return masks
 
 
-def refined_mask(share: Float[np.ndarray, "h w"], view: View, masker: AbstractMasker) -> Bool[np.ndarray, "h w"]:
-    """Mask of a part prompted by its own labels: `share` of each pixel that Gaussians labelled with it contribute.
+def along_path(first: View, views: list[View]) -> list[View]:
+    """All views as a video would show them: from the first in both directions, always on to the nearest camera."""
+    path = [first]
+    rest = [v for v in views if v.index != first.index]
+    distance = lambda a, b: float((a.camera.centre - b.camera.centre).norm())
+    while rest:
+        ahead, behind = (min(rest, key=lambda v: distance(end, v)) for end in (path[-1], path[0]))
+        if distance(path[-1], ahead) <= distance(path[0], behind):
+            path.append(ahead)
+            rest.remove(ahead)
+        else:
+            path.insert(0, behind)
+            rest.remove(behind)
+    return path
 
-    A mask that contradicts the labels is replaced by them.
+
+def refined_mask(
+    share: Float[np.ndarray, "h w"], view: View, room: Room | None, masker: AbstractMasker
+) -> Bool[np.ndarray, "h w"]:
+    """Mask of a part from its own labels: `share` of each pixel that Gaussians labelled with it contribute.
+
+    A mask that contradicts the labels is replaced by them. Outside its room the part cannot be, but where thin things
+    end depth is a mix with what lies behind: that rules out only what is well outside.
     """
     guess = share > 0.5
-    if guess.sum() < 20:
+    if guess.sum() < LEAST_REFINED:
         return np.zeros_like(guess)
-    band = guess.sum() ** 0.5
-    pixels = lambda m: np.argwhere(m)[:, ::-1] + 0.5
-    mask = masker(
-        view.image,
-        box=bounds(pixels(guess), 0.1, view),
-        positive=thinned(pixels(eroded(share > 0.9, round(0.02 * band))), masker.most_points),
-        negative=thinned(pixels(eroded(share < 0.1, 2 + round(0.05 * band))), masker.most_points),
-    )
+    mask = masker.refine(view.image, share)
+    if room is not None:
+        mask &= ~eroded(room.excludes(view), 0.08 * guess.sum() ** 0.5)
     return mask if (mask & guess).sum() > 0.6 * (mask | guess).sum() else guess
 
 
@@ -264,40 +288,9 @@ def mask_of_box(prompt: Prompt, view: View, masker: AbstractMasker) -> Bool[np.n
     if core.sum() < 10:
         return None
     v, u = np.nonzero(in_box)
-    box = np.array([u.min(), v.min(), u.max() + 1, v.max() + 1], float)
-    pixels = lambda m: np.argwhere(m)[:, ::-1] + 0.5
     return masker(
         view.image,
-        box=box,
-        positive=thinned(pixels(core), masker.most_points),
-        negative=thinned(pixels(opaque & ~in_box), masker.most_points),
+        box=np.array([u.min(), v.min(), u.max() + 1, v.max() + 1], float),
+        positive=thinned(centres(core), masker.most_points),
+        negative=thinned(centres(opaque & ~in_box), masker.most_points),
     )
-
-
-def bounds(uv: Float[np.ndarray, "m 2"], margin: float, view: View) -> Float[np.ndarray, " 4"]:
-    """Left, top, right, bottom of nearly all points [px], widened by `margin` times the longer side."""
-    lower, upper = np.quantile(uv, (0.01, 0.99), axis=0)
-    margin = margin * (upper - lower).max() + 2
-    size = np.tile([view.camera.width, view.camera.height], 2)
-    return np.clip(np.concatenate([lower - margin, upper + margin]), 0, size)
-
-
-def eroded(mask: Bool[np.ndarray, "h w"], reach: int) -> Bool[np.ndarray, "h w"]:
-    """Away from the outline, where depths mix; a thin object that would vanish keeps all its pixels."""
-    from scipy import ndimage
-
-    core = ndimage.distance_transform_edt(np.pad(mask, 1, mode="edge"))[1:-1, 1:-1] > reach
-    return core if core.sum() > 0.2 * mask.sum() else mask
-
-
-def share_within(mask: Bool[np.ndarray, "h w"], uv: Float[np.ndarray, "m 2"]) -> float:
-    """Share of the points [px], all in the image, that lie on the mask."""
-    u, v = np.floor(uv).astype(int).T
-    return float(mask[v, u].mean()) if len(uv) else 0.0
-
-
-def thinned(points, most: int):
-    """At most that many, evenly taken in order."""
-    if len(points) <= most:
-        return points
-    return points[np.linspace(0, len(points) - 1, most).round().astype(int)]
