@@ -33,7 +33,7 @@ from torch import Tensor
 from physics3d.artifact import require_finite
 from physics3d.gaussians.cameras import Camera
 from physics3d.gaussians.model import Gaussians
-from physics3d.gaussians.splatting import ENTRIES, Kernels, Numerics, kernels, median_kernel
+from physics3d.gaussians.splatting import ENTRIES, Kernels, Numerics, kernels
 from physics3d.gaussians.splatting import NEAR as NEAR
 
 STANDARD = Numerics()
@@ -130,7 +130,7 @@ class _State:
     gaussian: Tensor  # int32 [pairs]
     view: Any
     kernels: Kernels
-    numerics: Numerics
+    tile: int
 
     def lists(self) -> list[wp.array]:
         return [_warp(self.start), _warp(self.gaussian), _warp(self.splat, self.kernels.entry)]
@@ -151,8 +151,9 @@ def _project(mean, covariance, opacity, color, camera: Camera, antialiased: bool
     wp.init()
     n, device = len(mean), mean.device
     mean, covariance, opacity, color = (a.detach().contiguous() for a in (mean, covariance, opacity, color))
-    made = kernels(numerics, _side(device, numerics))
-    view = _view(made, camera, antialiased)
+    side = 1 if device.type == "cuda" else numerics.tile
+    made = kernels(numerics.precision, numerics.tile, side)
+    view = _view(made, camera, antialiased, numerics)
     splat = torch.empty(n, ENTRIES, device=device, dtype=mean.dtype)
     depth = torch.empty(2 * n, device=device)  # the second halves are room to sort
     order, count = (torch.empty(m, device=device, dtype=torch.int32) for m in (2 * n, n))
@@ -166,29 +167,25 @@ def _project(mean, covariance, opacity, color, camera: Camera, antialiased: bool
     last = torch.cumsum(count[order[:n]], 0, dtype=torch.int32)
     pairs = int(last[-1]) if n else 0
     tile, gaussian = (torch.empty(2 * pairs, device=device, dtype=torch.int32) for _ in range(2))
-    inputs = [outputs[2], _warp(last), outputs[3], outputs[0], camera.width, camera.height]
+    inputs = [outputs[2], _warp(last), outputs[3], outputs[0], view]
     outputs = [_warp(tile), _warp(gaussian)]
     _launch(made.list_tiles, shares, lambda part, begin: [begin, *inputs], outputs, device)
     tiles = -(-camera.width // numerics.tile) * -(-camera.height // numerics.tile)
     wp.utils.radix_sort_pairs(*outputs, pairs, end_bit=max(1, tiles.bit_length()))
     edges = torch.arange(tiles + 1, device=device, dtype=torch.int32)
     start = torch.searchsorted(tile[:pairs], edges, out_int32=True)
-    return _State(mean, covariance, opacity, splat, count, start, gaussian, view, made, numerics)
+    return _State(mean, covariance, opacity, splat, count, start, gaussian, view, made, numerics.tile)
 
 
-def _view(made: Kernels, camera: Camera, antialiased: bool):
+def _view(made: Kernels, camera: Camera, antialiased: bool, numerics: Numerics):
     view = made.View()
     M = camera.world_to_camera.detach().cpu().tolist()
     view.R = [M[i][:3] for i in range(3)]
     view.t = [M[i][3] for i in range(3)]
     view.fx, view.fy, view.cx, view.cy = camera.fx, camera.fy, camera.cx, camera.cy
     view.width, view.height, view.antialiased = camera.width, camera.height, int(antialiased)
+    view.cutoff, view.stop = numerics.cutoff, numerics.stop
     return view
-
-
-def _side(device: torch.device, numerics: Numerics) -> int:
-    """Side of a thread's square [px]."""
-    return 1 if device.type == "cuda" else numerics.tile
 
 
 def _cores() -> int:
@@ -206,7 +203,7 @@ def _tile_shares(state: _State) -> list[tuple[int, int]]:
     """Ranges of squares with about equal work, one per launch."""
     tiles = len(state.start) - 1
     if state.mean.is_cuda:
-        return [(0, tiles * state.numerics.tile**2)]
+        return [(0, tiles * state.tile**2)]
     cores = min(_cores(), tiles)
     work = state.start + 8 * torch.arange(tiles + 1)
     cuts = torch.searchsorted(work, torch.arange(1, cores) * int(work[-1]) // cores).tolist()
@@ -244,7 +241,7 @@ def _blend(state: _State, background: Tensor) -> list[Tensor]:
     """Colour, alpha, depth, transmittance."""
     size, like = (state.view.height, state.view.width), {"device": state.mean.device, "dtype": state.mean.dtype}
     pictures = [torch.empty(*size, 3, **like), *(torch.empty(size, **like) for _ in range(3))]
-    inputs, outputs = [*state.lists(), _warp(background.contiguous()), *size[::-1]], [_warp(p) for p in pictures]
+    inputs, outputs = [*state.lists(), _warp(background.contiguous()), state.view], [_warp(p) for p in pictures]
     _launch(state.kernels.blend, _tile_shares(state), lambda part, begin: [begin, *inputs], outputs, state.mean.device)
     return pictures
 
@@ -256,7 +253,7 @@ def _blend_adjoint(state: _State, pictures: list[Tensor], bars: list[Tensor | No
     given = [
         _warp(picture[:0] if bar is None else bar.contiguous()) for picture, bar in zip(pictures, bars, strict=False)
     ]
-    inputs = [*state.lists(), state.view.width, state.view.height, *(_warp(p) for p in pictures), *given]
+    inputs = [*state.lists(), state.view, *(_warp(p) for p in pictures), *given]
     outputs = [_rows(sums, ENTRIES)]
     kernel = state.kernels.blend_adjoint
     _launch(kernel, shares, lambda part, begin: [begin, part, *inputs], outputs, state.mean.device)
@@ -265,9 +262,10 @@ def _blend_adjoint(state: _State, pictures: list[Tensor], bars: list[Tensor | No
 
 def _middle(state: _State) -> Tensor:
     middle = torch.empty(state.view.height, state.view.width, device=state.mean.device, dtype=torch.int32)
-    inputs = [*state.lists(), state.view.width, state.view.height]
-    kernel = median_kernel(state.numerics, _side(middle.device, state.numerics))
-    _launch(kernel, _tile_shares(state), lambda part, begin: [begin, *inputs], [_warp(middle)], middle.device)
+    inputs = [*state.lists(), state.view]
+    _launch(
+        state.kernels.middle, _tile_shares(state), lambda part, begin: [begin, *inputs], [_warp(middle)], middle.device
+    )
     return middle
 
 

@@ -48,20 +48,14 @@ class Kernels:
     list_tiles: wp.Kernel
     blend: wp.Kernel
     blend_adjoint: wp.Kernel
+    middle: wp.Kernel
 
 
 @cache
-def kernels(numerics: Numerics, side: int) -> Kernels:
+def kernels(precision: str, tile: int, side: int) -> Kernels:
     """Kernels for squares of side x side pixels; compiled at their first launch."""
-    real = wp.float64 if numerics.precision == "float64" else wp.float32
-    project, project_adjoint, list_tiles, View = _projection(real, numerics.tile, numerics.cutoff)
-    blend, blend_adjoint, _ = _blending(real, side, numerics)
-    return Kernels(View, _entry(real), project, project_adjoint, list_tiles, blend, blend_adjoint)
-
-
-@cache
-def median_kernel(numerics: Numerics, side: int) -> wp.Kernel:
-    return _blending(wp.float64 if numerics.precision == "float64" else wp.float32, side, numerics)[2]
+    real = {"float32": wp.float32, "float64": wp.float64}[precision]
+    return Kernels(_view(real), _entry(real), *_projection(real, tile), *_blending(real, tile, side))
 
 
 @cache
@@ -84,14 +78,16 @@ def _view(real):
         width: int  # [px]
         height: int
         antialiased: int  # 1: opacity times sqrt(det / det with the low pass)
+        cutoff: real
+        stop: real
 
     return View
 
 
 @cache
-def _projection(real, tile: int, cutoff: float):
+def _projection(real, tile: int):
     vec3, mat33, entry, View = wp.types.vector(3, real), wp.types.matrix((3, 3), real), _entry(real), _view(real)
-    TILE, STEP, CUTOFF = tile, real(tile), real(cutoff)
+    TILE, STEP = tile, real(tile)
     PASS, CLOSE, SIDEWAYS = real(LOW_PASS), real(NEAR), real(MARGIN)
 
     @wp.func
@@ -101,10 +97,10 @@ def _projection(real, tile: int, cutoff: float):
         return wp.clamp(x, (-SIDEWAYS * n - c) / f, ((real(1.0) + SIDEWAYS) * n - c) / f)
 
     @wp.func
-    def tile_rows(s: entry, height: int) -> wp.vec2i:
+    def tile_rows(s: entry, view: View) -> wp.vec2i:
         """First row of tiles that the ellipse alpha = cutoff touches, and one past the last."""
-        reach = wp.sqrt(real(2.0) * wp.log(s[6] / CUTOFF) / s[5]) / STEP
-        n = real((height + TILE - 1) // TILE)
+        reach = wp.sqrt(real(2.0) * wp.log(s[6] / view.cutoff) / s[5]) / STEP
+        n = real((view.height + TILE - 1) // TILE)
         v = s[1] / STEP
         return wp.vec2i(
             int(wp.clamp(wp.floor(v - reach), real(0.0), n)),
@@ -112,9 +108,9 @@ def _projection(real, tile: int, cutoff: float):
         )
 
     @wp.func
-    def tile_columns(s: entry, row: int, width: int) -> wp.vec2i:
+    def tile_columns(s: entry, row: int, view: View) -> wp.vec2i:
         """The same for the tiles of one row: where the ellipse, inside that band of pixels, is widest."""
-        limit = real(2.0) * wp.log(s[6] / CUTOFF)
+        limit = real(2.0) * wp.log(s[6] / view.cutoff)
         d0 = real(row * TILE) - s[1]
         d1 = d0 + STEP
         # the ellipse is widest to the right at dy = top, to the left at dy = -top
@@ -124,7 +120,7 @@ def _projection(real, tile: int, cutoff: float):
         left = wp.clamp(-top, d0, d1)
         far = s[0] + s[4] * right + wp.sqrt(wp.max(limit - s[5] * right * right, real(0.0)) / s[3])
         near = s[0] + s[4] * left - wp.sqrt(wp.max(limit - s[5] * left * left, real(0.0)) / s[3])
-        n = real((width + TILE - 1) // TILE)
+        n = real((view.width + TILE - 1) // TILE)
         # a little wider, so that rounding loses no pixel
         return wp.vec2i(
             int(wp.clamp(wp.floor((near - real(0.01)) / STEP), real(0.0), n)),
@@ -152,7 +148,7 @@ def _projection(real, tile: int, cutoff: float):
         index[i] = i
         touched = int(0)
         out = entry()
-        if X[2] > CLOSE and opacity[i] >= CUTOFF:
+        if X[2] > CLOSE and opacity[i] >= view.cutoff:
             x = X[0] / X[2]
             y = X[1] / X[2]
             ju = (view.fx / X[2]) * vec3(real(1.0), real(0.0), -held(x, view.fx, view.cx, view.width))
@@ -170,15 +166,15 @@ def _projection(real, tile: int, cutoff: float):
             o = opacity[i]
             if view.antialiased == 1:
                 o = o * wp.sqrt(bare / det)
-            if o >= CUTOFF:
+            if o >= view.cutoff:
                 q = color[i]
                 out = entry(
                     view.fx * x + view.cx, view.fy * y + view.cy, X[2],
                     (c + PASS) / det, b / (c + PASS), real(1.0) / (c + PASS), o, q[0], q[1], q[2],
                 )  # fmt: skip
-                rows = tile_rows(out, view.height)
+                rows = tile_rows(out, view)
                 for row in range(rows[0], rows[1]):
-                    columns = tile_columns(out, row, view.width)
+                    columns = tile_columns(out, row, view)
                     touched += wp.max(columns[1] - columns[0], 0)
         splat[i] = out
         count[i] = touched
@@ -191,8 +187,7 @@ def _projection(real, tile: int, cutoff: float):
         last: wp.array(dtype=int),  # running sum of the tile counts in that order
         count: wp.array(dtype=int),
         splat: wp.array(dtype=entry),
-        width: int,
-        height: int,
+        view: View,
         # out
         tile: wp.array(dtype=int),  # of every pair (tile, Gaussian)
         gaussian: wp.array(dtype=int),
@@ -202,11 +197,11 @@ def _projection(real, tile: int, cutoff: float):
         if count[g] > 0:
             k = last[i] - count[g]
             s = splat[g]
-            rows = tile_rows(s, height)
+            rows = tile_rows(s, view)
             for row in range(rows[0], rows[1]):
-                columns = tile_columns(s, row, width)
+                columns = tile_columns(s, row, view)
                 for column in range(columns[0], columns[1]):
-                    tile[k] = row * ((width + TILE - 1) // TILE) + column
+                    tile[k] = row * ((view.width + TILE - 1) // TILE) + column
                     gaussian[k] = g
                     k += 1
 
@@ -289,15 +284,14 @@ def _projection(real, tile: int, cutoff: float):
         opacity_bar[i] = o_bar
         color_bar[i] = q_bar
 
-    return project, project_adjoint, list_tiles, View
+    return project, project_adjoint, list_tiles
 
 
 @cache
-def _blending(real, side: int, numerics: Numerics):
-    entry, row = _entry(real), wp.types.vector(side, real)
+def _blending(real, tile: int, side: int):
+    entry, View, row = _entry(real), _view(real), wp.types.vector(side, real)
     integers = wp.types.vector(side, wp.int32)
-    SIDE, TILE, MOST = side, numerics.tile, real(ALPHA_MAX)
-    CUTOFF, STOP = real(numerics.cutoff), real(numerics.stop)
+    SIDE, TILE, MOST = side, tile, real(ALPHA_MAX)
     # loops over pixels stay loops, which the compiler turns into wide instructions
     options = {
         "max_unroll": 1,
@@ -341,20 +335,20 @@ def _blending(real, side: int, numerics: Numerics):
         )
 
     @wp.func
-    def rows(s: entry, y0: int, y1: int) -> wp.vec2i:
+    def rows(s: entry, cutoff: real, y0: int, y1: int) -> wp.vec2i:
         """Rows of pixels, of y0..y1, that the ellipse alpha = cutoff touches."""
-        reach = wp.sqrt(real(2.0) * wp.log(s[6] / CUTOFF) / s[5])
+        reach = wp.sqrt(real(2.0) * wp.log(s[6] / cutoff) / s[5])
         first = wp.clamp(wp.ceil(s[1] - reach - real(0.5)), real(y0), real(y1))
         last = wp.clamp(wp.floor(s[1] + reach - real(0.5)) + real(1.0), real(y0), real(y1))
         return wp.vec2i(int(first), int(last))
 
     @wp.func
-    def light(T: row) -> int:
+    def light(T: row, stop: real) -> int:
         """1 if any pixel of the row still lets light through."""
         most = real(0.0)
         for x in range(SIDE):
             most = wp.max(most, T[x])
-        return wp.where(most >= STOP, 1, 0)
+        return wp.where(most >= stop, 1, 0)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=options)
     def blend(
@@ -364,14 +358,17 @@ def _blending(real, side: int, numerics: Numerics):
         gaussian: wp.array(dtype=int),
         splat: wp.array(dtype=entry),
         background: wp.array(dtype=real),  # [3]
-        width: int,
-        height: int,
+        view: View,
         # out
         color: wp.array3d(dtype=real),  # [h, w, 3]
         alpha: wp.array2d(dtype=real),
         depth: wp.array2d(dtype=real),  # [m]
         clear: wp.array2d(dtype=real),  # transmittance
     ):
+        width = view.width
+        height = view.height
+        cutoff = view.cutoff
+        stop = view.stop
         corner = square(begin + wp.tid(), width)
         x0 = corner[0]
         y0 = corner[1]
@@ -392,7 +389,7 @@ def _blending(real, side: int, numerics: Numerics):
             s = splat[gaussian[k]]
             k += 1
             u = s[0] - real(x0) - real(0.5)
-            span = rows(s, y0, y1)
+            span = rows(s, cutoff, y0, y1)
             for y in range(span[0], span[1]):
                 dy = real(y) + real(0.5) - s[1]
                 mid = u + s[4] * dy
@@ -408,8 +405,8 @@ def _blending(real, side: int, numerics: Numerics):
                     a = wp.min(s[6] * decay(e2 * dx * dx + e0), MOST)
                     t = T[x]
                     w = t * a
-                    w = wp.where(a >= CUTOFF, w, real(0.0))
-                    w = wp.where(t >= STOP, w, real(0.0))
+                    w = wp.where(a >= cutoff, w, real(0.0))
+                    w = wp.where(t >= stop, w, real(0.0))
                     T[x] = t - w
                     r[x] = r[x] + w * s[7]
                     g[x] = g[x] + w * s[8]
@@ -423,7 +420,7 @@ def _blending(real, side: int, numerics: Numerics):
             if k % wp.static(LOOK) == 0:
                 open = int(0)
                 for y in range(y1 - y0):
-                    open = wp.max(open, light(rays[0, y]))
+                    open = wp.max(open, light(rays[0, y], stop))
         for y in range(y1 - y0):
             T = rays[0, y]
             r = rays[1, y]
@@ -447,8 +444,7 @@ def _blending(real, side: int, numerics: Numerics):
         start: wp.array(dtype=int),
         gaussian: wp.array(dtype=int),
         splat: wp.array(dtype=entry),
-        width: int,
-        height: int,
+        view: View,
         color: wp.array3d(dtype=real),
         alpha: wp.array2d(dtype=real),
         depth: wp.array2d(dtype=real),
@@ -459,6 +455,10 @@ def _blending(real, side: int, numerics: Numerics):
         # out
         sums: wp.array2d(dtype=entry),  # [part, n] adjoint of `splat`, added to
     ):
+        width = view.width
+        height = view.height
+        cutoff = view.cutoff
+        stop = view.stop
         corner = square(begin + wp.tid(), width)
         x0 = corner[0]
         y0 = corner[1]
@@ -504,7 +504,7 @@ def _blending(real, side: int, numerics: Numerics):
             s = splat[i]
             k += 1
             u = s[0] - real(x0) - real(0.5)
-            span = rows(s, y0, y1)
+            span = rows(s, cutoff, y0, y1)
             # sums over pixels, of e_bar, the adjoint of the exponent, its moments, and of w times the pixels' adjoints
             m0 = row()
             m1 = row()
@@ -531,8 +531,8 @@ def _blending(real, side: int, numerics: Numerics):
                     dx = real(x) - mid
                     a = wp.min(s[6] * decay(e2 * dx * dx + e0), MOST)
                     t = T[x]
-                    a = wp.where(a >= CUTOFF, a, real(0.0))
-                    a = wp.where(t >= STOP, a, real(0.0))
+                    a = wp.where(a >= cutoff, a, real(0.0))
+                    a = wp.where(t >= stop, a, real(0.0))
                     w = t * a
                     T[x] = t - w
                     value = r[x] * s[7] + g[x] * s[8] + b[x] * s[9] + z[x] * s[2]
@@ -577,20 +577,23 @@ def _blending(real, side: int, numerics: Numerics):
             if k % wp.static(LOOK) == 0:
                 open = int(0)
                 for y in range(y1 - y0):
-                    open = wp.max(open, light(rays[0, y]))
+                    open = wp.max(open, light(rays[0, y], stop))
 
     @wp.kernel(module="unique", enable_backward=False, module_options=options)
-    def median_kernel(
+    def find_middle(
         # in
         begin: int,
         start: wp.array(dtype=int),
         gaussian: wp.array(dtype=int),
         splat: wp.array(dtype=entry),
-        width: int,
-        height: int,
+        view: View,
         # out
         middle: wp.array2d(dtype=int),  # Gaussian at which the transmittance falls below one half; -1 where it does not
     ):
+        width = view.width
+        height = view.height
+        cutoff = view.cutoff
+        stop = view.stop
         corner = square(begin + wp.tid(), width)
         x0 = corner[0]
         y0 = corner[1]
@@ -614,7 +617,7 @@ def _blending(real, side: int, numerics: Numerics):
             s = splat[i]
             k += 1
             u = s[0] - real(x0) - real(0.5)
-            span = rows(s, y0, y1)
+            span = rows(s, cutoff, y0, y1)
             for y in range(span[0], span[1]):
                 dy = real(y) + real(0.5) - s[1]
                 mid = u + s[4] * dy
@@ -626,8 +629,8 @@ def _blending(real, side: int, numerics: Numerics):
                     dx = real(x) - mid
                     a = wp.min(s[6] * decay(e2 * dx * dx + e0), MOST)
                     t = T[x]
-                    w = t * wp.where(a >= CUTOFF, a, real(0.0))
-                    w = wp.where(t >= STOP, w, real(0.0))
+                    w = t * wp.where(a >= cutoff, a, real(0.0))
+                    w = wp.where(t >= stop, w, real(0.0))
                     T[x] = t - w
                     at[x] = wp.where(t >= real(0.5) and t - w < real(0.5), i, at[x])
                 clear[y - y0] = T
@@ -635,10 +638,10 @@ def _blending(real, side: int, numerics: Numerics):
             if k % wp.static(LOOK) == 0:
                 open = int(0)
                 for y in range(y1 - y0):
-                    open = wp.max(open, light(clear[y]))
+                    open = wp.max(open, light(clear[y], stop))
         for y in range(y1 - y0):
             at = found[y]
             for x in range(nx):
                 middle[y0 + y, x0 + x] = at[x]
 
-    return blend, blend_adjoint, median_kernel
+    return blend, blend_adjoint, find_middle
