@@ -1,76 +1,276 @@
-"""Which inside test fills best: volume error, spread outside and time of each on bodies of known volume.
+"""Which inside test fills best: error against time on bodies of known shape, with noise, holes and missing caps.
 
-    python benchmarks/filling.py            prints the table, about a minute on one core
+    make bench-filling      five minutes on one core; writes docs/results/filling.{csv,md,png} and filling_slices.png
 
-Bodies are made of flat Gaussians with 0.5 mm noise; spacing 8 mm. "outside" is the share of particles farther than half
-a spacing outside the true body.
+Bodies are made of flat Gaussians, 1.5 mm wide; their centres lie off the surface by the noise. Particles are 6 mm
+apart. Conditions: noise of 0.3 (clean), 1 and 2 mm; a tenth of the surface missing in ten patches (holes); the lowest
+tenth of the body missing altogether (cap missing). IoU compares the solid that was found with the true one at 20 000
+random points (rms 0.4 %). The vote is what much research code does: inside is where at least 85 % of 26 directions meet
+a voxel of the surface.
 """
 
+import csv
 import sys
 import time
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
 sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parents[1] / "tests")]
 
-from analytic_bodies import annulus, box, cup, discs, sphere, together, torus, wall
+from analytic_bodies import annulus, box, cup, discs, petal, sphere, together, torus, wall
 
-from physics3d.filling import Poisson, WindingNumber, fill
+from benchmarks.machine import machine
+from physics3d.filling import AbstractSolid, Body, Poisson, Surface, WindingNumber, fill, sample_surface
+from physics3d.gaussians.model import Gaussians
 from physics3d.log import Log
 
-SPACING, NOISE = 0.008, 0.0005
+RESULTS = Path(__file__).parents[1] / "docs/results"
+SPACING, SEED = 0.006, 0
+PETAL_THICKNESS = 0.001  # [m]
+CONDITIONS = ("clean", "noise 1 mm", "noise 2 mm", "holes", "cap missing")
 norm = np.linalg.norm
 radius = lambda q: norm(q[:, :2], axis=1)
 
 
-def without_cap(point, normal):
-    return point[point[:, 2] > -0.04], normal[point[:, 2] > -0.04]
+@dataclass(frozen=True, kw_only=True)
+class Vote(AbstractSolid):
+    share: float = 0.85  # of the directions
+
+    def inside(self, surface: Surface, spacing: float) -> Callable[[np.ndarray], np.ndarray]:
+        return lambda x: surface.enclosure.share(x) >= self.share
 
 
-def bodies(rng):
-    """name -> surface, volume [m^3], signed distance (negative inside) of the true body [m]."""
+METHODS = {"Poisson": Poisson(), "winding number": WindingNumber(), "vote": Vote()}
+
+
+@dataclass(frozen=True)
+class Known:
+    """A body: samples of its surface, and its signed distance or something of the same sign, negative inside."""
+
+    surface: tuple[np.ndarray, np.ndarray]
+    distance: Callable[[np.ndarray], np.ndarray]
+    volume: float  # [m^3]
+
+
+def bodies(rng: np.random.Generator) -> dict[str, Known]:
     drum = lambda q, r, h: np.maximum(radius(q) - r, np.abs(q[:, 2] - h / 2) - h / 2)
-    ball = lambda q: norm(q, axis=1) - 0.05
-    ring = lambda q: np.hypot(radius(q) - 0.06, q[:, 2]) - 0.025
-    block = lambda q: (np.abs(q) - [0.05, 0.04, 0.03]).max(1)
-    mug = lambda q: np.maximum(drum(q, 0.05, 0.1), -np.maximum(radius(q) - 0.034, 0.016 - q[:, 2]))
-    yield "sphere", sphere(8000, 0.05, rng), 4 / 3 * np.pi * 0.05**3, ball
-    yield "sphere without cap", without_cap(*sphere(8000, 0.05, rng)), 4 / 3 * np.pi * 0.05**3, ball
-    yield "torus", torus(8000, 0.06, 0.025, rng), 2 * np.pi**2 * 0.06 * 0.025**2, ring
-    yield "box", box(8000, (0.05, 0.04, 0.03), rng), 8 * 0.05 * 0.04 * 0.03, block
+    ball = lambda q, r, x: norm(q - [x, 0, 0], axis=1) - r
+    mug = lambda q: np.maximum(drum(q, 0.05, 0.1), -np.maximum(radius(q) - 0.036, 0.014 - q[:, 2]))
+    pair = [(p + np.array([x, 0, 0]), n) for x in (-0.04, 0.04) for p, n in [sphere(5000, 0.04, rng)]]
     cake = together(wall(8000, 0.06, 0, 0.06, rng), annulus(4000, 0, 0.06, 0.06, rng))
-    yield "cake without base", cake, np.pi * 0.06**3, lambda q: drum(q, 0.06, 0.06)
-    yield "open cup", cup(0.05, 0.016, 0.1, rng), np.pi * (0.05**2 * 0.1 - 0.034**2 * 0.084), mug
+    leaf, area = petal(8000, rng)
+    return {
+        "sphere": Known(sphere(8000, 0.05, rng), lambda q: ball(q, 0.05, 0), 4 / 3 * np.pi * 0.05**3),
+        "torus": Known(
+            torus(9000, 0.06, 0.025, rng),
+            lambda q: np.hypot(radius(q) - 0.06, q[:, 2]) - 0.025,
+            2 * np.pi**2 * 0.06 * 0.025**2,
+        ),
+        "box": Known(
+            box(9000, (0.05, 0.04, 0.03), rng),
+            lambda q: (np.abs(q) - [0.05, 0.04, 0.03]).max(1),
+            8 * 0.05 * 0.04 * 0.03,
+        ),
+        "cup": Known(cup(0.05, 0.014, 0.1, rng), mug, np.pi * (0.05**2 * 0.1 - 0.036**2 * 0.086)),
+        "cake without base": Known(cake, lambda q: drum(q, 0.06, 0.06), np.pi * 0.06**3),
+        "two that touch": Known(
+            together(*pair),
+            lambda q: np.minimum(ball(q, 0.04, -0.04), ball(q, 0.04, 0.04)),
+            2 * 4 / 3 * np.pi * 0.04**3,
+        ),
+        "petal": Known(leaf, lambda q: np.full(len(q), 1.0), area * PETAL_THICKNESS),
+    }
+
+
+def seen(known: Known, condition: str, rng: np.random.Generator) -> Gaussians:
+    """The Gaussians that a reconstruction would give under this condition."""
+    point, normal = known.surface
+    keep = np.ones(len(point), bool)
+    if condition == "holes":
+        centre = point[rng.choice(len(point), 10, replace=False)]
+        nearest = cKDTree(point).query(centre, k=len(point) // 100)[1]
+        keep[nearest] = False
+    elif condition == "cap missing":
+        low, high = point[:, 2].min(), point[:, 2].max()
+        keep = point[:, 2] > low + 0.1 * (high - low)
+    noise = {"noise 1 mm": 0.001, "noise 2 mm": 0.002}.get(condition, 0.0003)
+    return discs(point[keep], normal[keep], rng, noise=noise)
+
+
+def filled(gaussians: Gaussians, solid: AbstractSolid, thin: bool) -> Body:
+    return fill(
+        gaussians,
+        torch.ones(len(gaussians), dtype=torch.int32),
+        spacing=SPACING,
+        opacity=0.1,
+        solid=solid,
+        interior=True,
+        sheet_thickness=PETAL_THICKNESS if thin else None,
+        isolated="keep",
+        drop_pieces_below=0.0,
+        attach=False,
+        log=Log(None),
+    )
+
+
+def measure(name: str, known: Known, condition: str, method: str) -> tuple[dict, np.ndarray]:
+    """One row of the table, and the particles [p, 3]."""
+    gaussians = seen(known, condition, np.random.default_rng(SEED + 1))
+    thin = name == "petal"
+    started = time.process_time()
+    body = filled(gaussians, METHODS[method], thin)
+    seconds = time.process_time() - started
+    particle = body.position.double().numpy()
+    rng = np.random.default_rng(SEED + 2)
+    point = known.surface[0]
+    q = rng.uniform(point.min(0) - 0.01, point.max(0) + 0.01, (20_000, 3))
+    surface, _ = sample_surface(gaussians, SPACING)
+    found, true = METHODS[method].inside(surface, SPACING)(q), known.distance(q) < 0
+    distance = known.distance(particle) if not thin else cKDTree(point).query(particle)[0]
+    apart = cKDTree(particle).query(particle, k=2)[0][:, 1] / SPACING
+    deep = np.abs(known.distance(particle)) > 1.5 * SPACING if not thin else np.ones(len(particle), bool)
+    row = dict(body=name, condition=condition, method=method, seconds=seconds, particles=len(particle))
+    # of a petal nothing may be solid: the share of its particles that are not in its sheet takes the place of 1 - IoU
+    row["iou"] = (found & true).sum() / (found | true).sum() if not thin else 1 - (distance > SPACING / 2).mean()
+    row["volume_error"] = float(body.volume.double().sum()) / known.volume - 1
+    row["outside"] = (distance > SPACING / 2).mean()
+    row["apart"] = float(np.median(apart))
+    row["closest"] = float(apart.min())
+    row["per_cell"] = per_cell(particle[deep]) if deep.sum() > 50 and not thin else float("nan")
+    print({k: round(v, 4) if isinstance(v, float) else v for k, v in row.items()}, flush=True)
+    return row, particle
+
+
+def per_cell(particle: np.ndarray) -> float:
+    """Particles in each cell of two spacings, mean over the cells whose 26 neighbours are occupied too."""
+    cell, count = np.unique(np.floor(particle / (2 * SPACING) + 0.25).astype(int), axis=0, return_counts=True)
+    tree = cKDTree(cell)
+    inner = np.array([len(n) == 27 for n in tree.query_ball_point(cell, 1.1, p=np.inf)])
+    return float(count[inner].mean()) if inner.any() else float("nan")
 
 
 def main() -> None:
-    print(f"{'body':20} {'inside test':15} {'particles':>9} {'volume error':>12} {'outside':>8} {'time':>7}")
-    for name, surface, volume, distance in bodies(np.random.default_rng(0)):
-        gaussians = discs(*surface, np.random.default_rng(1), noise=NOISE)
-        for solid in (Poisson(), WindingNumber()):
-            started = time.perf_counter()
-            body = fill(
-                gaussians,
-                torch.ones(len(gaussians), dtype=torch.int32),
-                spacing=SPACING,
-                opacity=0.1,
-                solid=solid,
-                interior=True,
-                sheet_thickness=None,
-                isolated="keep",
-                drop_pieces_below=0.0,
-                attach=False,
-                log=Log(None),
-            )
-            seconds = time.perf_counter() - started
-            error = float(body.volume.double().sum()) / volume - 1
-            outside = (distance(body.position.double().numpy()) > SPACING / 2).mean()
-            print(
-                f"{name:20} {type(solid).__name__:15} {len(body.position):9} {100 * error:+10.1f} % "
-                f"{100 * outside:6.1f} % {seconds:5.1f} s"
-            )
+    rows, shown = [], {}
+    for name, known in bodies(np.random.default_rng(SEED)).items():
+        for condition in CONDITIONS:
+            for method in METHODS:
+                row, particle = measure(name, known, condition, method)
+                rows.append(row)
+                if condition == "cap missing":
+                    shown[name, method] = known, particle
+    RESULTS.mkdir(parents=True, exist_ok=True)
+    title = f"{machine('cpu')}, 1 thread, seed {SEED}"
+    with (RESULTS / "filling.csv").open("w", newline="") as file:
+        file.write(f"# {title}\n")
+        table = csv.DictWriter(file, list(rows[0]))
+        table.writeheader()
+        table.writerows(rows)
+    draw(rows, title)
+    draw_slices(shown)
+    (RESULTS / "filling.md").write_text(page(rows, title))
+
+
+def draw(rows: list[dict], title: str) -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12, 4.8), layout="constrained")
+    figure.suptitle(title, fontsize=9)
+    names, markers = list(dict.fromkeys(r["body"] for r in rows)), "osD^vP*"
+    left, right = figure.subplots(1, 2)
+    for i, method in enumerate(METHODS):
+        for name, marker in zip(names, markers, strict=True):
+            mine = [r for r in rows if r["method"] == method and r["body"] == name]
+            style = dict(color=f"C{i}", alpha=0.7, marker=marker, linestyle="none")
+            label = method if name == names[0] else None
+            left.plot([r["seconds"] for r in mine], [max(1 - r["iou"], 1e-4) for r in mine], label=label, **style)
+            right.plot([r["seconds"] for r in mine], [max(abs(r["volume_error"]), 1e-4) for r in mine], **style)
+    for name, marker in zip(names, markers, strict=True):
+        right.plot([], [], color="0.4", marker=marker, linestyle="none", label=name)
+    left.axhline(0.05, color="0.5", linestyle=":", label="target, closed")
+    left.axhline(0.10, color="0.5", linestyle="--", label="target, cap missing")
+    right.axhline(0.03, color="0.5", linestyle=":", label="target")
+    left.set(xscale="log", yscale="log", xlabel="processor time [s]", ylabel="1 - IoU")
+    right.set(xscale="log", yscale="log", xlabel="processor time [s]", ylabel="relative error of the volume")
+    for axis in (left, right):
+        axis.grid(which="both", alpha=0.2)
+        axis.legend(fontsize=7)
+    figure.savefig(RESULTS / "filling.png", dpi=100)
+
+
+def draw_slices(shown: dict) -> None:
+    """Particles within half a spacing of the plane y = 0, and the outline of the true body."""
+    from matplotlib.figure import Figure
+
+    names = list(dict.fromkeys(name for name, _ in shown))
+    figure = Figure(figsize=(2.3 * len(names), 2.1 * len(METHODS)), layout="constrained")
+    for axis, ((name, method), (known, particle)) in zip(
+        figure.subplots(len(METHODS), len(names)).T.reshape(-1), shown.items(), strict=True
+    ):
+        low, high = known.surface[0].min(0) - 0.01, known.surface[0].max(0) + 0.01
+        x, z = np.meshgrid(np.linspace(low[0], high[0], 200), np.linspace(low[2], high[2], 200))
+        if name != "petal":
+            value = known.distance(np.stack([x, 0 * x, z], -1).reshape(-1, 3)).reshape(x.shape)
+            axis.contour(x, z, value, levels=[0], colors="k", linewidths=0.8)
+        near = np.abs(particle[:, 1]) < SPACING / 2
+        axis.scatter(particle[near, 0], particle[near, 2], s=5, color=f"C{list(METHODS).index(method)}")
+        axis.set(xlim=(low[0], high[0]), ylim=(low[2], high[2]), xticks=[], yticks=[], aspect="equal")
+        if method == next(iter(METHODS)):
+            axis.set_title(name, fontsize=9)
+        if name == names[0]:
+            axis.set_ylabel(method, fontsize=9)
+    figure.savefig(RESULTS / "filling_slices.png", dpi=80)
+
+
+def page(rows: list[dict], title: str) -> str:
+    lines = ["# Filling: which inside test", "", f"Made by `make bench-filling`. Machine: {title}.", ""]
+    lines += [*__doc__.split("\n\n", 2)[2].strip().splitlines(), "", "![error against time](filling.png)", ""]
+    lines += ["Slices y = 0 with the lowest tenth of every body missing, true outline in black:", ""]
+    lines += ["![slices](filling_slices.png)", "", "## What it shows", ""]
+    lines += [f"- {sentence}" for sentence in findings(rows)]
+    lines += ["", "## Every run", ""]
+    lines += ["Of the petal nothing may be solid: its IoU is the share of particles in its sheet.", ""]
+    lines += ["| body | condition | method | IoU | volume error | outside | nearest neighbour | per cell | s |"]
+    lines += ["|---|---|---|---|---|---|---|---|---|"]
+    for r in rows:
+        cell = "" if np.isnan(r["per_cell"]) else f"{r['per_cell']:.2f}"
+        lines.append(
+            f"| {r['body']} | {r['condition']} | {r['method']} | {r['iou']:.3f} | {100 * r['volume_error']:+.1f} % | "
+            f"{100 * r['outside']:.1f} % | {r['apart']:.2f} ({r['closest']:.2f}) | {cell} | {r['seconds']:.2f} |"
+        )
+    lines += [
+        "",
+        "outside: particles farther than half a spacing outside; nearest neighbour: median (least), in spacings;",
+    ]
+    lines += ["per cell: particles in a cell of two spacings, inside."]
+    return "\n".join(lines) + "\n"
+
+
+def findings(rows: list[dict]) -> list[str]:
+    sentences = []
+    for method in METHODS:
+        mine = [r for r in rows if r["method"] == method]
+        closed = [r for r in mine if r["condition"] in ("clean", "noise 1 mm", "holes")]
+        capless = [r for r in mine if r["condition"] == "cap missing"]
+        right = sum(r["iou"] >= 0.95 and abs(r["volume_error"]) <= 0.03 for r in closed)
+        open_ = sum(r["iou"] >= 0.90 for r in capless)
+        worst = min(closed + capless, key=lambda r: r["iou"])
+        sentences.append(
+            f"{method}: {right} of {len(closed)} runs with noise up to 1 mm or holes have IoU >= 0.95 and a volume "
+            f"within 3 %, {open_} of {len(capless)} without a cap IoU >= 0.90; worst of these {worst['iou']:.2f} "
+            f"({worst['body']}, {worst['condition']}); median {np.median([r['seconds'] for r in mine]):.2f} s of "
+            "processor time."
+        )
+    cell = [r["per_cell"] for r in rows if r["method"] == "Poisson" and not np.isnan(r["per_cell"])]
+    sentences.append(
+        f"Spacing (Poisson): {np.mean(cell):.2f} particles in a cell of two spacings inside the bodies "
+        f"({min(cell):.2f} to {max(cell):.2f})."
+    )
+    return sentences
 
 
 if __name__ == "__main__":
