@@ -128,17 +128,26 @@ class Mixture(base.AbstractMaterial):
         return found
 
     def advance(self, real: type) -> wp.Function:
-        functions = tuple(m.advance(real) for m in self._kinds)
-        rows = tuple(m.memory_rows for m in self._kinds)
-        return functions[0] if len(functions) == 1 else _advance(functions, rows, real)
+        kinds, most = self._kinds, self.memory_rows
+        function = kinds[-1].advance(real)
+        rows = kinds[-1].memory_rows
+        for number in range(len(kinds) - 2, -1, -1):
+            kind = kinds[number]
+            function = _either(number, kind.advance(real), kind.memory_rows, function, rows, most, real)
+            rows = most
+        return function
 
 
 @functools.cache
-def _advance(functions: tuple[wp.Function, ...], rows: tuple[int, ...], real: type) -> wp.Function:
-    mat33 = spectral.matrix_type(real)
-    last, most = len(functions) - 1, max(rows)
+def _either(
+    number: int, own: wp.Function, own_rows: int, other: wp.Function, other_rows: int, most: int, real: type
+) -> wp.Function:
+    """`own` for particles of this number, `other` for the rest; memory beyond that of the model is left as it is.
 
-    @wp.func(name="mixture_of_" + "_".join(function.key for function in functions))
+    Models are chained, not listed: Warp's cache of kernels does not see a function behind a static index."""
+    mat33 = spectral.matrix_type(real)
+
+    @wp.func(name=f"{own.key}_or_{other.key}")
     def advance(
         p: int,
         dt: real,  # [s]
@@ -148,16 +157,14 @@ def _advance(functions: tuple[wp.Function, ...], rows: tuple[int, ...], real: ty
         memory: wp.array2d(dtype=real),
         memory_next: wp.array2d(dtype=real),
     ):
-        kind = int(coefficients[coefficients.shape[0] - 1, p] + real(0.5))
-        for i in range(wp.static(last)):
-            if kind == i:
-                for row in range(wp.static(rows[i]), wp.static(most)):
-                    memory_next[row, p] = memory[row, p]
-                H_next, tau = wp.static(functions[i])(p, dt, L, H, coefficients, memory, memory_next)
-                return H_next, tau
-        for row in range(wp.static(rows[last]), wp.static(most)):
+        if int(coefficients[coefficients.shape[0] - 1, p] + real(0.5)) == number:
+            for row in range(own_rows, most):
+                memory_next[row, p] = memory[row, p]
+            H_own, tau_own = own(p, dt, L, H, coefficients, memory, memory_next)
+            return H_own, tau_own
+        for row in range(other_rows, most):
             memory_next[row, p] = memory[row, p]
-        H_last, tau_last = wp.static(functions[last])(p, dt, L, H, coefficients, memory, memory_next)
-        return H_last, tau_last
+        H_next, tau = other(p, dt, L, H, coefficients, memory, memory_next)
+        return H_next, tau
 
     return spectral.without_replay(advance)

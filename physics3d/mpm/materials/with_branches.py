@@ -89,14 +89,16 @@ class WithBranches(base.AbstractMaterial):
         return coefficients[:first], coefficients[first:]
 
     def advance(self, real: type) -> wp.Function:
-        return _advance(self.solid.advance(real), self.solid.memory_rows, self.branches, self.spring, real)
+        rows = base.coefficient_rows(self.solid), self.solid.memory_rows
+        return _advance(self.solid.advance(real), *rows, self.branches, self.spring, real)
 
 
 @functools.cache
-def _advance(solid: wp.Function, solid_rows: int, branches: int, spring: str, real: type) -> wp.Function:
+def _advance(
+    solid: wp.Function, coefficient_rows: int, memory_rows: int, branches: int, spring: str, real: type
+) -> wp.Function:
     mat33 = spectral.matrix_type(real)
     all_branches = maxwell_branches(branches, spring, real)
-    behind = 4 * branches
 
     @wp.func(name=f"{solid.key}_with_{branches}_{spring}")
     def advance(
@@ -109,8 +111,7 @@ def _advance(solid: wp.Function, solid_rows: int, branches: int, spring: str, re
         memory_next: wp.array2d(dtype=real),
     ):
         H_next, tau = solid(p, dt, L, H, coefficients, memory, memory_next)
-        first = coefficients.shape[0] - behind
-        tau_N = all_branches(p, dt, dt * L, first, solid_rows, coefficients, memory, memory_next)
+        tau_N = all_branches(p, dt, dt * L, coefficient_rows, memory_rows, coefficients, memory, memory_next)
         return H_next, tau + tau_N
 
     return spectral.without_replay(advance)
