@@ -10,9 +10,10 @@
 Every array of a state is written once per substep and nothing is updated in place, so the adjoints of the kernels are
 launched in reverse order on adjoint arrays that add up. Those of the transfers are written out, the others generated.
 
-On a CPU a Warp kernel runs on one thread, so the particles are divided over Python threads (a launch releases the GIL);
-each scatters into a grid of its own, and the grids are summed in a fixed order: reruns are equal bit by bit. On CUDA
-there is one worker and the scatter is atomic.
+On a CPU the particles' part is one pass (`fused`) together with the scatter of the next substep; the kernels here are
+its twins, what CUDA runs, and what the adjoint is of. A Warp kernel runs on one thread there, so the particles are
+divided over Python threads (a launch releases the GIL); each scatters into a grid of its own, and the grids are summed
+in a fixed order: reruns are equal bit by bit. On CUDA there is one worker and the scatter is atomic.
 """
 
 import threading
@@ -25,10 +26,9 @@ import torch
 import warp as wp
 
 from physics3d.mpm import transfer
+from physics3d.mpm.fused import Hook, particle_pass
 from physics3d.mpm.state import State, make_state
 from physics3d.mpm.transfer import matrix, vector, vector4
-
-Hook = tuple[wp.Function, int, int, int]  # function, first parameter, first signal, row of the selection
 
 
 @cache
@@ -241,9 +241,16 @@ def _advance(real, material: wp.Function) -> wp.Kernel:
     return advance_kernel
 
 
+_KEEP = 5  # place of `keep`, then `onward`, among the arguments of the particle pass
+_MULTIPLY_ADD = "-ffp-contract=fast"  # one rounding for a b + c where the processor can, on the CPU as on CUDA
+
+
 def start_warp() -> None:
     """Start Warp without its banner; before anything else of Warp is touched."""
     wp.config.log_level = wp.LOG_WARNING
+    flags = wp.config.cpu_compiler_flags or ""
+    if _MULTIPLY_ADD not in flags:
+        wp.config.cpu_compiler_flags = f"{flags} {_MULTIPLY_ADD}".strip()
     wp.init()
 
 
@@ -277,6 +284,7 @@ class Substeps:
         memory_rows: int,
         longest_run: int,  # substeps
         threads: int,
+        fast: bool | None = None,  # one pass over the particles per substep; None: on a CPU
     ):
         self.dtype, self.device = mass.dtype, mass.device
         self.real = wp.float32 if self.dtype == torch.float32 else wp.float64
@@ -284,12 +292,15 @@ class Substeps:
         self.origin = vector(self.real)(*origin)
         self.gravity = vector(self.real)(*gravity)
         self.mass_floor = 1e-12 * float(mass.mean())
+        self.fast = self.device.type == "cpu" if fast is None else fast
         self.kernels = {
-            "scatter": transfer.scatter(self.real),
+            "scatter": transfer.scatter(self.real, self.fast),
             "update": _update(self.real, nodes, walls is not None),
-            "gather": transfer.gather(self.real),
+            "gather": transfer.gather(self.real, self.fast),
             "advance": _advance(self.real, material),
         }
+        if self.fast:
+            self.kernels["pass"] = particle_pass(self.real, material, pushes, steers)
         if pushes:
             self.kernels["push"] = _push(self.real, pushes)
         if steers:
@@ -336,7 +347,7 @@ class Substeps:
         self.window.assign(np.array([*lowest, *size], np.int32))
         self.node_count = int(np.prod(size))
         if self.node_count > self.capacity:
-            self.capacity = int(1.5 * self.node_count)
+            self.capacity = int(1.5 * self.node_count) + 1  # one more: see `columns`
             self.grid = self._zeros((self.workers, self.capacity), vector4(self.real))
             self.node_velocity = self._zeros(self.capacity, vector(self.real))
             if self.adjoint is not None:
@@ -344,7 +355,9 @@ class Substeps:
             self._drop_launches()
 
     def run(self, clock: np.ndarray, path: Sequence[int]) -> int:
-        """Substep s takes state path[s] to state path[s + 1] by row s of the clock; the count of lost particles."""
+        """Substep s takes state path[s] to state path[s + 1] by row s of the clock; the count of lost particles.
+
+        A path may stay at one state: in place. Velocities and stress on the way are then not kept."""
         self._set_clock(clock)
         for lost in self.lost:
             lost.zero_()
@@ -352,7 +365,7 @@ class Substeps:
         launches = [[self._forward(w, i, j) for i, j in work] for w in range(self.workers)]
         dims = self._dims()
 
-        def worker(w: int, wait: Callable[[], object]) -> None:
+        def plain(w: int, wait: Callable[[], object]) -> None:
             for s, launch in enumerate(launches[w]):
                 self._set_row(w, s)
                 self._scatter_phase(launch)
@@ -363,7 +376,22 @@ class Substeps:
                     if name in launch:
                         launch[name].launch()
 
-        self._on_all(worker)
+        def fast(w: int, wait: Callable[[], object]) -> None:
+            last = len(work) - 1
+            self._set_row(w, 0)
+            self._scatter_phase(launches[w][0])
+            for s, launch in enumerate(launches[w]):
+                self._set_row(w, s)
+                wait()
+                self._update_phase(launch, *dims[w], wait)
+                wait()
+                if s < last:
+                    self._span(launch["clear"], 0, self.node_count)
+                launch["pass"].set_param_at_index(_KEEP, int(s == last or work[s][0] != work[s][1]))
+                launch["pass"].set_param_at_index(_KEEP + 1, int(s < last))
+                launch["pass"].launch()
+
+        self._on_all(fast if self.fast else plain)
         return sum(int(lost.numpy()[0]) for lost in self.lost)
 
     def start(self, clock: np.ndarray, i: int, j: int) -> None:
@@ -433,7 +461,7 @@ class Substeps:
                         adjoint[name].launch()
                 wait()
                 first, count = dims[w]
-                if count and self.workers > 1:
+                if count and "total" in adjoint:
                     self._span(adjoint["total"], first, count)
                 if self.mirrored:
                     wait()
@@ -502,7 +530,13 @@ class Substeps:
                 [first, *clock, a["u"], b["v"], b["L"], a["H"], c["coefficients"], a["memory"]],
                 [b["u"], b["H"], b["memory"], b["tau"]],
             ),
-        }
+            "pass": (
+                [first, self.dx, self.window, *clock, 1, 1, c["selection"], c["rest"], c["q"], c["mass"], c["volume"],
+                 c["cell"], c["offset"], c["coefficients"], self.node_velocity, a["u"], a["H"], a["memory"]],
+                [*(b[name] for name in ("u", "H", "memory", "v_gathered", "L_gathered", "v", "L", "tau")),
+                 self.grid[w], self.lost[w]],
+            ),
+        }  # fmt: skip
 
     def _forward(self, w: int, i: int, j: int) -> dict[str, wp.Launch]:
         key = ("forward", w, i, j)
@@ -539,24 +573,29 @@ class Substeps:
             count = self.ranges[w][1]
             record = {}
             arguments = self._arguments(w, i, j)
+            vec3, vec4 = vector(self.real), vector4(self.real)
+            private = self.adjoint_fours if self.fast else self.adjoint_node_velocity
             for name, adjoint_arrays in adjoints.items():
                 if name in self.kernels:
                     record[name] = self._record(self.kernels[name], count, *arguments[name], adjoint_arrays)
             record["scatter"] = self._record(
-                transfer.scatter_adjoint(self.real),
+                transfer.scatter_adjoint(self.real, self.fast),
                 count,
                 [*arguments["scatter"][0], self.adjoint_grid],
                 [*place, v, a["L"], a["tau"]],
             )
             record["gather"] = self._record(
-                transfer.gather_adjoint(self.real),
+                transfer.gather_adjoint(self.real, self.fast),
                 count,
                 [*arguments["gather"][0], b["v_gathered"], b["L_gathered"]],
-                [*place, self.adjoint_node_velocity[w]],
+                [*place, private[w]],
             )
-            vec3, vec4 = vector(self.real), vector4(self.real)
-            record["total"] = self._record(transfer.total(vec3), 1, [0], [self.adjoint_node_velocity])
-            record["clear_private"] = self._record(transfer.clear(vec3), 1, [0], [self.adjoint_node_velocity[w]])
+            if self.fast:
+                outputs = [self.adjoint_node_velocity[0]]
+                record["total"] = self._record(transfer.total_of_fours(self.real), 1, [0, private], outputs)
+            elif self.workers > 1:
+                record["total"] = self._record(transfer.total(vec3), 1, [0], [private])
+            record["clear_private"] = self._record(transfer.clear(vec4 if self.fast else vec3), 1, [0], [private[w]])
             if self.v_pushed is not None:
                 first = [self.ranges[w][0]]
                 record["clear_pushed"] = self._record(transfer.clear(vec3), count, first, [adjoint["v_pushed"]])
@@ -637,6 +676,8 @@ class Substeps:
     def _make_adjoint_grid(self) -> None:
         self.adjoint_grid = self._zeros(self.capacity, vector4(self.real))
         self.adjoint_node_velocity = self._zeros((self.workers, self.capacity), vector(self.real))
+        if self.fast:
+            self.adjoint_fours = self._zeros((self.workers, self.capacity), vector4(self.real))
 
     def _drop_launches(self) -> None:
         self.launches: dict[tuple, dict[str, wp.Launch]] = {}

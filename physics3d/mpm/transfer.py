@@ -25,6 +25,8 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
+from physics3d.mpm import columns
+
 
 def vector(real) -> type:
     """3-vector of `real` (wp.float32 or wp.float64)."""
@@ -89,10 +91,11 @@ def stencil(real) -> tuple[wp.Function, wp.Function, wp.Function, wp.Function]:
 
 
 @cache
-def scatter(real) -> wp.Kernel:
+def scatter(real, fast: bool = False) -> wp.Kernel:
     """Kernel: mass and momentum (with the internal forces of one step) of particles onto the nodes."""
     vec3, vec4, mat33 = vector(real), vector4(real), matrix(real)
     base, local, weights, _ = stencil(real)
+    spread = columns.spread(real, fast)
 
     @wp.kernel(module="unique", enable_backward=False)
     def scatter_kernel(
@@ -128,25 +131,7 @@ def scatter(real) -> wp.Kernel:
             m = mass[p]
             A = (m * dx) * L[p] - (real(4.0) * dt * volume[p] / dx) * tau[p]
             q = m * v[p] - A * f
-            first_node = (int(ix) * ny + int(iy)) * nz + int(iz)
-            ax, ay, az = (
-                vec3(A[0, 0], A[1, 0], A[2, 0]),
-                vec3(A[0, 1], A[1, 1], A[2, 1]),
-                vec3(A[0, 2], A[1, 2], A[2, 2]),
-            )
-            qi = q  # the affine momentum at the node, built up by its increments from node to node
-            for i in range(3):
-                qij = qi
-                for j in range(3):
-                    wij = w[0, i] * w[1, j]
-                    qijk = qij
-                    for k in range(3):
-                        weight = wij * w[2, k]
-                        value = vec4(weight * qijk[0], weight * qijk[1], weight * qijk[2], weight * m)
-                        wp.atomic_add(grid, first_node + (i * ny + j) * nz + k, value)
-                        qijk = qijk + az
-                    qij = qij + ay
-                qi = qi + ax
+            spread(grid, (int(ix) * ny + int(iy)) * nz + int(iz), ny, nz, w, q, m, A)
         else:
             wp.atomic_add(lost, 0, 1)
 
@@ -154,10 +139,11 @@ def scatter(real) -> wp.Kernel:
 
 
 @cache
-def gather(real) -> wp.Kernel:
+def gather(real, fast: bool = False) -> wp.Kernel:
     """Kernel: velocity and velocity gradient of particles from the nodes."""
     vec3, mat33 = vector(real), matrix(real)
     base, local, weights, _ = stencil(real)
+    gathered = columns.gathered(real, fast)
 
     @wp.kernel(module="unique", enable_backward=False)
     def gather_kernel(
@@ -183,41 +169,24 @@ def gather(real) -> wp.Kernel:
         if inside and iz <= real(nz - 3):
             f = local(d)
             w = weights(f)
-            first_node = (int(ix) * ny + int(iy)) * nz + int(iz)
-            mean, bx, by, bz = vec3(), vec3(), vec3(), vec3()
-            one = real(1.0)
-            rx = -f[0]
-            for i in range(3):
-                ry = -f[1]
-                for j in range(3):
-                    s, sz = vec3(), vec3()  # sums along a column of nodes
-                    rz = -f[2]
-                    for k in range(3):
-                        a = w[2, k] * node_velocity[first_node + (i * ny + j) * nz + k]
-                        s = s + a
-                        sz = sz + rz * a
-                        rz = rz + one
-                    wij = w[0, i] * w[1, j]
-                    mean = mean + wij * s
-                    bx = bx + (wij * rx) * s
-                    by = by + (wij * ry) * s
-                    bz = bz + wij * sz
-                    ry = ry + one
-                rx = rx + one
-            v[p] = mean
-            L[p] = (real(4.0) / dx) * wp.matrix_from_cols(bx, by, bz)
+            S = gathered(node_velocity, (int(ix) * ny + int(iy)) * nz + int(iz), ny, nz, f, w)
+            v[p] = vec3(S[0, 0], S[0, 1], S[0, 2])
+            L[p] = (real(4.0) / dx) * mat33(
+                S[1, 0], S[2, 0], S[3, 0], S[1, 1], S[2, 1], S[3, 1], S[1, 2], S[2, 2], S[3, 2]
+            )
 
     return gather_kernel
 
 
 @cache
-def scatter_adjoint(real) -> wp.Kernel:
+def scatter_adjoint(real, fast: bool = False) -> wp.Kernel:
     """Kernel: adjoint of `scatter`. With the adjoint (P, M) of a node's momentum and mass and r = x_i - x_p in cells,
 
     adj v = m sum w P,   adj A = sum w P r^T,   adj x = sum grad w [ P . (m v + A r) + m M ] - A^T sum w P
     """
     vec3, vec4, mat33 = vector(real), vector4(real), matrix(real)
     base, local, weights, slopes = stencil(real)
+    spread_adjoint = columns.spread_adjoint(real, fast)
 
     @wp.kernel(module="unique", enable_backward=False)
     def scatter_adjoint_kernel(
@@ -249,7 +218,7 @@ def scatter_adjoint(real) -> wp.Kernel:
         corner = base(cell[p], d)
         nx, ny, nz = window[3], window[4], window[5]
         ix, iy, iz = corner[0] - real(window[0]), corner[1] - real(window[1]), corner[2] - real(window[2])
-        zero, one = real(0.0), real(1.0)
+        zero = real(0.0)
         inside = ix >= zero and iy >= zero and iz >= zero and ix <= real(nx - 3) and iy <= real(ny - 3)
         if inside and iz <= real(nz - 3):
             f = local(d)
@@ -257,43 +226,11 @@ def scatter_adjoint(real) -> wp.Kernel:
             m = mass[p]
             stress = real(4.0) * dt * volume[p] / dx
             A = (m * dx) * L[p] - stress * tau[p]
-            ax = vec3(A[0, 0], A[1, 0], A[2, 0])
-            ay = vec3(A[0, 1], A[1, 1], A[2, 1])
-            az = vec3(A[0, 2], A[1, 2], A[2, 2])
-            first_node = (int(ix) * ny + int(iy)) * nz + int(iz)
-            qi = m * v[p] - A * f
-            mean, bx, by, bz, slope = vec3(), vec3(), vec3(), vec3(), vec3()
-            rx = -f[0]
-            for i in range(3):
-                qij = qi
-                ry = -f[1]
-                for j in range(3):
-                    s, sz = vec3(), vec3()  # along a column of nodes: sum w P, sum w r_z P,
-                    e, ez = zero, zero  # sum w [P . q + m M], sum w' [P . q + m M]
-                    q = qij
-                    rz = -f[2]
-                    for k in range(3):
-                        node = adjoint_grid[first_node + (i * ny + j) * nz + k]
-                        P = vec3(node[0], node[1], node[2])
-                        power = wp.dot(P, q) + m * node[3]
-                        a = w[2, k] * P
-                        s = s + a
-                        sz = sz + rz * a
-                        e = e + w[2, k] * power
-                        ez = ez + g[2, k] * power
-                        q = q + az
-                        rz = rz + one
-                    wij = w[0, i] * w[1, j]
-                    mean = mean + wij * s
-                    bx = bx + (wij * rx) * s
-                    by = by + (wij * ry) * s
-                    bz = bz + wij * sz
-                    slope = slope + vec3(g[0, i] * w[1, j] * e, w[0, i] * g[1, j] * e, wij * ez)
-                    qij = qij + ay
-                    ry = ry + one
-                qi = qi + ax
-                rx = rx + one
-            B = wp.matrix_from_cols(bx, by, bz)
+            S = spread_adjoint(
+                adjoint_grid, (int(ix) * ny + int(iy)) * nz + int(iz), ny, nz, f, w, g, m * v[p] - A * f, m, A
+            )
+            mean, slope = vec3(S[0, 0], S[0, 1], S[0, 2]), vec3(S[4, 0], S[4, 1], S[4, 2])
+            B = mat33(S[1, 0], S[2, 0], S[3, 0], S[1, 1], S[2, 1], S[3, 1], S[1, 2], S[2, 2], S[3, 2])
             adjoint_d = slope - wp.transpose(A) * mean
             adjoint_offset[p] = adjoint_offset[p] + adjoint_d
             adjoint_u[p] = adjoint_u[p] + adjoint_d / dx
@@ -305,13 +242,16 @@ def scatter_adjoint(real) -> wp.Kernel:
 
 
 @cache
-def gather_adjoint(real) -> wp.Kernel:
-    """Kernel: adjoint of `gather`. With the adjoints V of v and (dx/4) B of L, and r = x_i - x_p in cells,
+def gather_adjoint(real, fast: bool = False) -> wp.Kernel:
+    """Kernel: adjoint of `gather`, onto nodes of 4-vectors if fast. With the adjoints V of v and (dx/4) B of L, and
+    r = x_i - x_p in cells,
 
     adj v_i = sum_p w (V + B r),   adj x = sum_i grad w [ v_i . (V + B r) ] - B^T v_p
     """
     vec3, mat33 = vector(real), matrix(real)
     base, local, weights, slopes = stencil(real)
+    gathered_adjoint = columns.gathered_adjoint(real, fast)
+    node_kind = vector4(real) if fast else vec3
 
     @wp.kernel(module="unique", enable_backward=False)
     def gather_adjoint_kernel(
@@ -328,7 +268,7 @@ def gather_adjoint(real) -> wp.Kernel:
         # out, added to
         adjoint_offset: wp.array(dtype=vec3),
         adjoint_u: wp.array(dtype=vec3),
-        adjoint_node_velocity: wp.array(dtype=vec3),
+        adjoint_node_velocity: wp.array(dtype=node_kind),
     ):
         p = wp.tid() + first
         d = offset[p] + u[p] / dx
@@ -341,31 +281,11 @@ def gather_adjoint(real) -> wp.Kernel:
             f = local(d)
             w, g = weights(f), slopes(f)
             B = (real(4.0) / dx) * adjoint_L[p]
-            ax = vec3(B[0, 0], B[1, 0], B[2, 0])
-            ay = vec3(B[0, 1], B[1, 1], B[2, 1])
-            az = vec3(B[0, 2], B[1, 2], B[2, 2])
             first_node = (int(ix) * ny + int(iy)) * nz + int(iz)
-            qi = adjoint_v[p] - B * f
-            mean, slope = vec3(), vec3()
-            for i in range(3):
-                qij = qi
-                for j in range(3):
-                    s, e, ez = vec3(), zero, zero  # along a column of nodes: sum w v, sum w v . q, sum w' v . q
-                    q = qij
-                    wij = w[0, i] * w[1, j]
-                    for k in range(3):
-                        n = first_node + (i * ny + j) * nz + k
-                        velocity = node_velocity[n]
-                        power = wp.dot(velocity, q)
-                        s = s + w[2, k] * velocity
-                        e = e + w[2, k] * power
-                        ez = ez + g[2, k] * power
-                        wp.atomic_add(adjoint_node_velocity, n, (wij * w[2, k]) * q)
-                        q = q + az
-                    mean = mean + wij * s
-                    slope = slope + vec3(g[0, i] * w[1, j] * e, w[0, i] * g[1, j] * e, wij * ez)
-                    qij = qij + ay
-                qi = qi + ax
+            S = gathered_adjoint(
+                node_velocity, adjoint_node_velocity, first_node, ny, nz, w, g, adjoint_v[p] - B * f, B
+            )
+            mean, slope = vec3(S[0, 0], S[0, 1], S[0, 2]), vec3(S[1, 0], S[1, 1], S[1, 2])
             adjoint_d = slope - wp.transpose(B) * mean
             adjoint_offset[p] = adjoint_offset[p] + adjoint_d
             adjoint_u[p] = adjoint_u[p] + adjoint_d / dx
@@ -407,6 +327,28 @@ def total(dtype) -> wp.Kernel:
         grids[0, i] = s
 
     return total_kernel
+
+
+@cache
+def total_of_fours(real) -> wp.Kernel:
+    """Kernel: the first three numbers of the sum over the rows of grids [threads, node], in a fixed order."""
+    vec3, vec4 = vector(real), vector4(real)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def total_of_fours_kernel(
+        # in
+        first: int,
+        grids: wp.array2d(dtype=vec4),  # [threads, node]
+        # out
+        values: wp.array(dtype=vec3),  # [node]
+    ):
+        i = wp.tid() + first
+        s = grids[0, i]
+        for t in range(1, grids.shape[0]):
+            s = s + grids[t, i]
+        values[i] = vec3(s[0], s[1], s[2])
+
+    return total_of_fours_kernel
 
 
 def velocity_gradient(
