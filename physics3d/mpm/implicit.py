@@ -7,7 +7,7 @@ The unknowns are the node velocities v at the end of the step; weights and place
     T_p = tau(L_p) (I + dt L_p)^-T,   L_p(v) as in the gather, tau from the material as it is              [Pa]
 
 T_p = P F_n^T, so dt f is minus the gradient by v of the potential sum V_p psi((I + dt L_p) F_n): its Jacobian K is
-symmetric for every material that has a potential, and angular momentum is kept about the places at the end of the step.
+symmetric for every material that has a potential, and f has no torque about the places at the end of the step.
 
 Newton. C_p = dT/dL, 9 x 9 per particle, comes from nine launches of the adjoint that the material has anyway. The
 linear systems P^T (M + K) P d = -P^T r are solved by conjugate gradients without assembling K; C is taken symmetric,
@@ -276,10 +276,10 @@ class ImplicitSubsteps:
     def step(self, clock: np.ndarray, i: int, j: int) -> Step:
         """State j from state i by the first row of the clock. Raises NotConverged."""
         self._begin(clock, i, j)
-        free = self._bounded(self._velocity(self.base))
+        free = self._update(gravity=True)
         v = self._bounded(self.present * self.momentum / self.safe_mass)  # as if nothing happened
         if not self._forces(v):
-            raise NotConverged("the motion of one step folds particles")
+            raise NotConverged("particles left the grid, or their motion would fold them in one step")
         self._linearise(symmetric=True)
         if not self.mirrored:
             blocks = torch.linalg.inv(self.inverse_blocks).diagonal(dim1=1, dim2=2).mean(1)[:, None]
@@ -365,23 +365,26 @@ class ImplicitSubsteps:
         self._on_particles("gather", "steer", "advance", "stress", "force")
         self._sum(self.grid)
         self.grid[0] += self.base
-        self.u = self._velocity(self.grid[0])
-        return not any(int(count.numpy()[0]) for count in counts) and bool(torch.isfinite(self.u).all())
+        self.falls = True
+        return not any(int(count.numpy()[0]) for count in counts) and bool(torch.isfinite(self.grid[0]).all())
 
     def _residual(self, v: Tensor) -> Tensor:
         """(v - B(v + s (u(v) - v)))/s [m/s] after `_forces`. The root is the same for any s > 0; m over the diagonal
-        of M + K guesses the nodes that separate far better than s = 1."""
-        return (v - self._bounded(v + self.reach * (self.u - v))) / self.reach
-
-    def _velocity(self, grid: Tensor) -> Tensor:
-        """Of momentum and mass, with gravity and damping, before the boundaries."""
-        return self.present * self.decay * (grid[:, :3] / self.safe_mass + self.dt * self.gravity)
+        of M + K guesses the nodes that separate far better than s = 1, which mirrored walls need."""
+        if self.mirrored:
+            return v - self._update(gravity=True)
+        u = self.present * self.decay * (self.grid[0, :, :3] / self.safe_mass + self.dt * self.gravity)
+        return (v - self._bounded(v + self.reach * (u - v))) / self.reach
 
     def _bounded(self, v: Tensor) -> Tensor:
-        """B(v); the grid then holds momentum and mass that give v."""
-        self.grid[0] = self.base
-        self.grid[0, :, :3] = self.present * self.safe_mass * (v / self.decay - self.dt * self.gravity)
-        self._on_nodes("update")
+        """B(v)."""
+        self.grid[0, :, :3] = self.present * self.safe_mass * (v / self.decay)
+        return self._update(gravity=False)
+
+    def _update(self, *, gravity: bool) -> Tensor:
+        """Velocities of what the grid holds, after damping, boundaries and perhaps gravity, a copy."""
+        self.falls = gravity
+        self._on_nodes("update" if gravity else "update_still")
         return self.nodes.clone()
 
     def _noise(self, v: Tensor) -> float:
@@ -435,8 +438,7 @@ class ImplicitSubsteps:
             images = [self._derivative(y) for y in x]
             off = abs(self._dot(self.mass * x[0], images[1]) - self._dot(self.mass * x[1], images[0]))
             off += abs(self._dot(self.mass * x[0], self._derivative(images[1]) - images[1]))
-            if off > 1e-4 * self._norm(x[0]) * self._norm(x[1]):
-                raise ValueError("sliding friction beside mirroring walls cannot be implicit; take scheme='explicit'")
+            self.projectors = off <= 1e-4 * self._norm(x[0]) * self._norm(x[1])
         elif self.bounded:
             self.P = self.momentum.new_empty((self.count, 3, 3))
             for k in range(3):
@@ -451,8 +453,20 @@ class ImplicitSubsteps:
         grid = wp.to_torch(self.probe_grid)[: self.count]
         grid.zero_()
         wp.to_torch(self.probe_velocity)[: self.count] = x
-        self._on_nodes("update_probe")
+        self._on_nodes("probe" if self.falls else "probe_still")
         return grid[:, :3].clone()
+
+    def _difference(self, x: Tensor) -> Tensor:
+        """P x by central differences."""
+        there = self.grid[0].clone()
+        size = self._norm(there[:, :3] / self.safe_mass) / max(self._norm(x), torch.finfo(x.dtype).tiny)
+        h = self.rounding ** (1 / 3) * size
+        ends = []
+        for sign in (1, -1):
+            self.grid[0, :, :3] = there[:, :3] + sign * h * self.mass * x
+            ends.append(self._update(gravity=self.falls))
+        self.grid[0] = there
+        return (ends[0] - ends[1]) / (2 * h) if h > 0 else torch.zeros_like(x)
 
     def _newton_direction(self, residual: Tensor, target: float) -> tuple[Tensor, int]:
         """d of one Newton step, with a residual up to `target` [kg^1/2 m/s]; and the count of products with K.
@@ -550,8 +564,11 @@ class ImplicitSubsteps:
 
     def _derivative(self, x: Tensor, *, transposed: bool = False) -> Tensor:
         """P x: what the boundaries make of a change of velocity; or P^T x."""
-        if self.mirrored:  # P/M is symmetric
-            return self.mass * self._pull(x) if transposed else self._pull(self.mass * x)
+        if self.mirrored:
+            if transposed:
+                return self.mass * self._pull(x)
+            # P/M is symmetric, unless something slides with friction
+            return self._pull(self.mass * x) if self.projectors else self._difference(x)
         if self.P is None:
             return self.present * x
         return ((self.P.mT if transposed else self.P) * x[:, None, :]).sum(2)
@@ -652,6 +669,8 @@ class ImplicitSubsteps:
         sub, own, c = self.substeps, self.adjoint, self.substeps.constant
         arguments = sub._arguments(w, *self.pair)
         a, b = (sub.state(k).warp for k in self.pair)
+        if name.endswith("_still"):
+            arguments["update"][0][3] = vector(self.real)()  # gravity
         first, count = sub.ranges[w]
         clock = [sub.clock, sub.row[w]]
         place = [c["cell"], c["offset"], a["u"]]
@@ -675,8 +694,10 @@ class ImplicitSubsteps:
             return launch(sub.kernels[kernel], *arguments[kernel], adjoints)
 
         real = self.real
-        if name in ("push", "gather", "steer", "advance", "update"):
+        if name in ("push", "gather", "steer", "advance"):
             return launch(sub.kernels[name], *arguments[name]) if name in sub.kernels else None
+        if name in ("update", "update_still"):
+            return launch(sub.kernels["update"], *arguments["update"])
         if name == "scatter":
             return launch(transfer.scatter(real), scattered, [sub.grid[w], sub.lost[w]])
         if name == "stress":
@@ -695,7 +716,7 @@ class ImplicitSubsteps:
         if name == "stiffness":
             inputs = [first, sub.dx, sub.window, *clock, c["volume"], *place, self.C, self.w]
             return launch(_stiffness(real), inputs, [self.Kw[w]])
-        if name == "update_probe":
+        if name in ("probe", "probe_still"):
             return again("update", {-1: self.probe_grid}, {0: self.probe_velocity})
         adjoint = sub.adjoint
         assert adjoint is not None
