@@ -5,13 +5,17 @@ import math
 
 import pytest
 import torch
+from mpm_bodies import every_material
 
 from physics3d.mpm import driver
 from physics3d.mpm.materials.drucker_prager import DruckerPrager
+from physics3d.mpm.materials.herschel_bulkley import HerschelBulkley
 from physics3d.mpm.materials.neo_hookean import NeoHookean
 from physics3d.mpm.materials.newtonian import Newtonian
+from physics3d.mpm.materials.snow import Snow
 from physics3d.mpm.materials.viscoelastic import Viscoelastic
 from physics3d.mpm.materials.von_mises import VonMises
+from physics3d.mpm.materials.with_branches import WithBranches
 
 ONE = torch.eye(3, dtype=torch.float64)
 BRANCH = Viscoelastic(elastic=False)
@@ -80,13 +84,32 @@ def test_shear_start_up_has_the_known_stress():
     torch.testing.assert_close(shear_start_up(BRANCH, 128, torch.float32), known, rtol=1e-4, atol=0)
 
 
-@pytest.mark.parametrize("spring", ["hencky", "neo_hookean"])
-def test_shear_start_up_is_second_order(spring):
-    material = Viscoelastic(elastic=False, spring=spring)
-    fine = shear_start_up(material, 1024)
-    errors = [(shear_start_up(material, n) - fine).norm().item() for n in (16, 32, 64)]
-    assert errors[0] / errors[1] > 3.6  # 4 for second order, 2 for first
-    assert errors[1] / errors[2] > 3.6
+RATE_DEPENDENT = [
+    (Viscoelastic(), {}),
+    (Viscoelastic(spring="neo_hookean"), {}),
+    (Viscoelastic(branches=3), {}),
+    (WithBranches(), {}),
+    (HerschelBulkley(), {"flow_index": 0.5, "consistency": 1e3}),
+    (HerschelBulkley(), {"flow_index": 1.0, "consistency": 1e3}),
+]
+
+
+@pytest.mark.parametrize("material, changes", RATE_DEPENDENT, ids=str)
+def test_every_rate_dependent_law_is_second_order(material, changes):
+    """Shear that starts at once and swells: slope of the error over the number of steps. A fluid's stress belongs to
+    the rate in the middle of the step, so it is not among them."""
+    values = numbers(**(material.example | changes))
+
+    def at_the_end(n):
+        time = torch.linspace(0, 0.2, n + 1, dtype=torch.float64)
+        return deviator(driver.simple_shear(material, values, time, 2 * time + 20 * time**2)[-1])
+
+    fine, counts = at_the_end(640), [20, 40, 80]
+    errors = torch.tensor([(at_the_end(n) - fine).norm().item() for n in counts]).log()
+    steps = torch.tensor(counts).log()
+    slope = ((steps - steps.mean()) * (errors - errors.mean())).sum() / ((steps - steps.mean()) ** 2).sum()
+    # where yielding begins within a step its error is of second order too, but of no fixed factor
+    assert -2.4 < slope < -1.85
 
 
 def test_neo_hookean_branch_follows_its_differential_equation():
@@ -119,6 +142,26 @@ def test_small_oscillation_has_the_zener_moduli():
     # (dt omega)^2/12 = 8e-5 of the interpolation between rows; transients e^{-k_d 7 periods}
     assert storage.item() == pytest.approx(mu_E + mu * omega**2 / (omega**2 + k_d**2), rel=2e-4)
     assert loss.item() == pytest.approx(mu * omega * k_d / (omega**2 + k_d**2), rel=2e-4)
+
+
+TWO = WithBranches(solid=VonMises(), branches=2, spring="neo_hookean")
+
+
+@pytest.mark.parametrize("material", [*every_material(), Viscoelastic(branches=3), TWO], ids=str)
+def test_tension_and_compression_free_the_sides_of_every_material(material):
+    stretch = torch.cat([torch.linspace(1, 1.3, 6), torch.linspace(1.3, 0.8, 9)[1:]]).double()
+    time = torch.arange(len(stretch), dtype=torch.float64) * 0.05
+    tau, lateral = driver.uniaxial(material, numbers(**material.example), time, stretch)
+    F = torch.diag_embed(torch.stack([stretch, lateral, lateral], 1))
+    replayed = driver.prescribed(material, numbers(**material.example), time, F)
+    scale = material.wave_modulus(material.coefficients(numbers(**material.example))).item()
+    # the sides are free to 1e-12 of the stiffness; rounding of the table moves stiff ones as much again
+    torch.testing.assert_close(replayed[:, 0, 0], tau, rtol=0, atol=1e-10 * scale)
+    assert replayed[:, 1, 1].abs().max() < 1e-10 * scale
+    if isinstance(material, DruckerPrager):  # dry sand that nothing confines
+        assert tau.abs().max() < 1e-10 * scale
+    else:
+        assert tau[5] > 1e-5 * scale and tau[-1] < -1e-5 * scale
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
@@ -188,6 +231,108 @@ def test_fluid_in_shear_has_its_viscosity(n):
     tau = driver.simple_shear(Newtonian(), values, time, rate * time)[-1]
     assert tau[0, 1].item() == pytest.approx(k * rate**n, rel=1e-6)  # (g_0/g)^2 of the regularisation
     assert tau.diagonal().abs().max() < 1e-6
+
+
+@pytest.mark.parametrize("n", [0.5, 1.0, 1.5])
+def test_paste_in_shear_flows_by_its_law_at_any_step(n):
+    """Steady state q = tau_y + k g^n, also with steps of a hundred relaxation times k/mu."""
+    rate, tau_y, k = 4.0, 10.0, 3.0
+    values = numbers(youngs_modulus=1e5, poissons_ratio=0.3, yield_stress=tau_y, consistency=k, flow_index=n)
+    for steps in (20, 2000):
+        time = torch.linspace(0, 1, steps + 1, dtype=torch.float64)
+        tau = driver.simple_shear(HerschelBulkley(), values, time, rate * time)[-1]
+        # the flow is simple shear up to elastic strains q/mu = 1e-3
+        assert deviator(tau).norm().item() / math.sqrt(2) == pytest.approx(tau_y + k * rate**n, rel=3e-3)
+
+
+def test_paste_held_relaxes_to_its_yield_stress():
+    """dz/dt = -mu (z/k)^2 for n = 1/2: 1/z grows linearly. Below yield nothing flows."""
+    mu, tau_y, k, gamma = 1e3, 10.0, 50.0, 0.05
+    values = numbers(youngs_modulus=2.6 * mu, poissons_ratio=0.3, yield_stress=tau_y, consistency=k, flow_index=0.5)
+    dt = 1e-3
+    time = torch.arange(1001, dtype=torch.float64) * dt
+    held = torch.full((1001,), gamma, dtype=torch.float64)
+    held[0] = 0
+    tau = driver.simple_shear(HerschelBulkley(), values, time, held)
+    q = deviator(tau).flatten(1).norm(dim=1) / math.sqrt(2)
+    trial = mu * 2 * math.asinh(gamma / 2)  # Hencky strain of simple shear
+    age = time[1:] - dt / 2  # relaxation surrounds the step in time
+    expected = tau_y + 1 / (1 / (trial - tau_y) + mu * age / k**2)
+    torch.testing.assert_close(q[1:], expected, rtol=1e-4, atol=0)  # (dt mu z / k^2)^2 = 3e-4 at the start, over 12
+    tau = driver.simple_shear(HerschelBulkley(), values, time, 0.15 * held)
+    torch.testing.assert_close(tau[-1], tau[1], rtol=0, atol=1e-10 * mu)
+
+
+def test_snow_is_packed_at_its_critical_compression_and_hardens():
+    """Squeezed alike from all sides: every principal strain stays at ln(1 - theta_c), the rest is J_P."""
+    E, nu, theta, xi = 1e5, 0.2, 0.03, 8.0
+    values = numbers(
+        youngs_modulus=E, poissons_ratio=nu, critical_compression=theta, critical_stretch=0.006, hardening=xi
+    )
+    size = torch.linspace(1, 0.9, 11, dtype=torch.float64)
+    path = size[:, None, None] * ONE
+    tau = driver.prescribed(Snow(), values, torch.arange(11, dtype=torch.float64), path)
+    strain = torch.clamp(size.log(), min=math.log(1 - theta))
+    J_P = (size / strain.exp()) ** 3
+    pressure = torch.exp(xi * (1 - J_P)) * E / (3 * (1 - 2 * nu)) * 3 * strain
+    torch.testing.assert_close(tau.diagonal(dim1=1, dim2=2).mean(1), pressure, rtol=1e-10, atol=1e-9)
+
+
+def test_snow_pulled_one_way_and_squeezed_the_others_gains_no_energy():
+    """Plain clamping of the stretches would: there the stress along the pull is a pressure, yet the snow is pulled."""
+    values = numbers(**(Snow().example | {"hardening": 0.0}))
+    c = Snow().coefficients(values)
+    H, memory, work = torch.zeros(1, 3, 3, dtype=torch.float64), torch.zeros(7, 1, dtype=torch.float64), 0.0
+    rate = torch.diag(torch.tensor([1.0, -1.5, -1.5], dtype=torch.float64))[None]
+    before = torch.zeros_like(H)
+    for _ in range(400):
+        H, tau, memory = driver.advance(Snow(), 1.0, 2e-4 * rate, H, c, memory)
+        power = (0.5 * (tau + before) * 2e-4 * rate).sum().item()
+        work, before = work + power, tau
+        assert power > -1e-9
+        # stored energy never exceeds work but for the trapezoidal rule
+        assert work - Snow().energy(c, H, memory).item() > -1e-3 * work
+
+
+def test_branches_add_to_the_stress_of_the_solid():
+    """tau = tau_solid + tau_branches, each along its own history: to round-off."""
+    F = ONE + 0.03 * torch.randn(12, 3, 3, generator=torch.Generator().manual_seed(0)).double().cumsum(0)
+    F[0] = ONE
+    time = torch.arange(12, dtype=torch.float64) * 0.02
+    both, solid, branches = (
+        driver.prescribed(m, numbers(**m.example), time, F) for m in (WithBranches(), NeoHookean(), BRANCH)
+    )
+    torch.testing.assert_close(both, solid + branches, rtol=1e-12, atol=1e-8)
+
+
+def test_three_branches_are_recovered_from_a_curve_by_gradient():
+    """A relaxation test with a fast ramp, as a laboratory would: seven numbers from 40 rows, least squares."""
+    time = torch.cat([torch.linspace(0, 0.1, 6), torch.logspace(-0.9, 1.5, 34)]).double()
+    shear = torch.clamp(time / 0.1, max=1.0) * 0.4
+    material = Viscoelastic(branches=3)
+    free = ["youngs_modulus", *(name for name in material.parameters if name.startswith("branch_shear"))]
+    free += [name for name in material.parameters if name.startswith("shear_viscosity")]
+    truth = [6e4, 3e4, 2e4, 1e4, 0.3, 2.0, 12.0]
+    fixed = numbers(**material.example)
+
+    def curve(logs):
+        values = fixed | dict(zip(free, logs.exp(), strict=True))
+        return driver.simple_shear(material, values, time, shear)[:, 0, 1]
+
+    exact = torch.tensor(truth, dtype=torch.float64).log()
+    target = curve(exact).detach()
+    logs = (exact + torch.tensor([0.3, -0.4, 0.4, -0.3, 0.4, -0.4, 0.3])).requires_grad_()
+    optimizer = torch.optim.LBFGS([logs], max_iter=120, history_size=20, line_search_fn="strong_wolfe")
+
+    def loss():
+        optimizer.zero_grad()
+        value = ((curve(logs) - target) / target.max()).square().mean() * 1e4
+        value.backward()
+        return value
+
+    optimizer.step(loss)
+    # sums of exponentials are ill-conditioned: the curve agrees far better than the numbers; seen 2e-5
+    torch.testing.assert_close(logs.detach(), exact, rtol=0, atol=1e-3)
 
 
 def test_tables_that_cannot_be_right_are_refused():
