@@ -33,6 +33,7 @@ from physics3d.log import Log
 from physics3d.mpm.boundaries.base import AbstractBoundary, Setting, Vector, mirror_nodes
 from physics3d.mpm.implicit import ImplicitSubsteps, NotConverged
 from physics3d.mpm.substep import Hook, Substeps, start_warp
+from physics3d.mpm.survey import Survey, survey
 from physics3d.mpm.transfer import velocity_gradient
 from physics3d.mpm.world import World
 
@@ -291,7 +292,7 @@ class _Solver:
             if self.world.dt is not None:
                 return
             now = self.substeps.state(self.current)
-            explicit, implicit = self._explicit_need(self._limit(now)), self._implicit_need(now)
+            explicit, implicit = self._explicit_need(self._limit(now, self._look(now))), self._implicit_need(now)
             if explicit < WORTH * implicit:
                 return
             self.log.info(f"frame {frame}: implicit, for the explicit scheme would need {explicit} substeps a frame")
@@ -330,59 +331,55 @@ class _Solver:
             self.substeps.set_window(lowest, size)
             clock = self._clock((frame - 1) * self.frame_dt + done * dt, dt, steps)
             runs.append(_Run(lowest, size, clock, now.flat.clone() if keep else None))
-            path = [(self.current + s) % 2 for s in range(steps + 1)]
+            path = [self.current] * (steps + 1)
             lost = self.substeps.run(clock, path)
             self.work["lost"] += lost
-            self.current = path[-1]
             self._inspect(frame, dt, lost)
         return runs
 
     def _inspect(self, frame: int, dt: float, lost: int) -> None:
         """After a run: is every number finite, every particle in the region, and every substep short enough?"""
         now = self.substeps.state(self.current)
-        bad = (~torch.isfinite(now.flat[: 3 * len(now.u)].view(-1, 3) + now.tau.sum((1, 2))[:, None])).any(1)
-        if bool(bad.any()):
-            count = int(bad.sum())
+        seen = self._look(now)
+        if seen.infinite:
+            bad = ~torch.isfinite(now.u.sum(1) + now.v.square().sum(1) + now.tau.square().sum((1, 2)))
             raise _TooFast(
-                f"{count} of {len(bad)} particles have become infinite or NaN, first {self._who(bad)}", self.remedy
+                f"{seen.infinite} of {len(bad)} particles have become infinite or NaN, first {self._who(bad)}",
+                self.remedy,
             )
         if lost:
             raise _TooFast(
                 f"particles moved too far in a few substeps ({lost} times outside the grid)",
                 "a weaker force or a slower start",
             )
-        limit, speed = self._limit(now), now.v.norm(dim=1)
-        if self.implicit and dt * float(speed.max()) > self.world.dx:
-            way = dt * float(speed.max()) / self.world.dx
+        limit = self._limit(now, seen)
+        if self.implicit and dt * seen.speed > self.world.dx:
+            way, speed = dt * seen.speed / self.world.dx, now.v.norm(dim=1)
             who = self._who(speed == speed.max())
             raise _TooFast(f"{who} moves {way:.3g} cells in a step", "a weaker force or a slower start")
         if not self.implicit and dt > limit.dt:
             raise _TooFast(limit.why, limit.remedy)
-        x = self.rest + now.u
-        slack = 1.5 * self.world.dx
-        low, high = x.new_tensor(self.setting.lower) - slack, x.new_tensor(self.setting.upper) + slack
-        outside = int(((x < low) | (x > high)).any(1).sum())
-        if outside:
+        if seen.outside:
             raise ValueError(
-                f"frame {frame}: {outside} of {len(x)} particles left the simulated region {_corners(self.setting)}; "
-                "enlarge world.lower and world.upper, or add a BoundingBox or a HalfSpace"
+                f"frame {frame}: {seen.outside} of {len(now.u)} particles left the simulated region "
+                f"{_corners(self.setting)}; enlarge world.lower and world.upper, or add a BoundingBox or a HalfSpace"
             )
 
     def _window(self, now, steps: int, dt: float, reach: float, frame: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """Nodes around the particles, with room for `reach` times the way they can go in `steps` substeps of dt [s]."""
         duration = steps * dt
-        speed = float(now.v.norm(dim=1).max()) + math.hypot(*self.world.gravity) * duration
-        cells = self.cell + (self.offset + now.u / self.world.dx).floor()
+        seen = self._look(now)
+        speed = seen.speed + math.hypot(*self.world.gravity) * duration
         # a legal substep moves no particle farther than a cell, so no more room than that, however fast they are
         room = 2 + math.ceil(min(reach * (1 + speed * duration / self.world.dx), reach + steps))
-        lowest = cells.amin(0) - room
-        size = cells.amax(0) + room + 1 - lowest
-        if not bool(torch.isfinite(size).all()) or float(size.double().prod()) > MOST_NODES:
-            across = " x ".join(f"{s:g}" for s in size.tolist())
+        lowest = tuple(cell - room for cell in seen.lowest)
+        size = tuple(high + room + 1 - low for high, low in zip(seen.highest, lowest))
+        if seen.infinite or math.prod(size) > MOST_NODES:
+            across = " x ".join(f"{s:g}" for s in size)
             raise ValueError(
                 f"frame {frame}: the particles spread over {across} cells; take a larger dx or a BoundingBox"
             )
-        return tuple(int(i) for i in lowest), tuple(int(i) for i in size)
+        return lowest, size
 
     def _clock(self, t: float, dt: float, steps: int) -> np.ndarray:
         """Table for the kernels: dt, exp(-damping dt), signals of all boundaries."""
@@ -392,16 +389,19 @@ class _Solver:
             rows.append([dt, math.exp(-self.world.damping * dt), *signals])
         return np.array(rows)
 
-    def _speeds(self, now) -> tuple[float, float]:
-        """(fastest wave, fastest particle) [m/s]."""
-        low, high = _extreme_eigenvalues(now.tau.double())
+    def _look(self, now) -> Survey:
         modulus = self.modulus * self.world.material.stiffening(self.coefficients, now.memory)
-        c = ((modulus.double() + 2 * torch.maximum(high, -low)) / self.world.density).sqrt().max()
-        return float(c), float(now.v.double().norm(dim=1).max())
+        slack = 1.5 * self.world.dx
+        low, high = self.rest.new_tensor(self.setting.lower) - slack, self.rest.new_tensor(self.setting.upper) + slack
+        return survey(now, self.substeps.constant, modulus, self.world.dx, low, high)
 
-    def _limit(self, now) -> _Limit:
+    def _speeds(self, seen: Survey) -> tuple[float, float]:
+        """(fastest wave, fastest particle) [m/s]."""
+        return (seen.stiffness / self.world.density) ** 0.5, seen.speed
+
+    def _limit(self, now, seen: Survey) -> _Limit:
         """How long an explicit substep may be in this state."""
-        c, v = self._speeds(now)
+        c, v = self._speeds(seen)
         dx, density = self.world.dx, self.world.density
         eta = float(self.world.material.viscosity(self.coefficients, now.L).max())
         waves, viscous = dx / (math.sqrt(3) * c), density * dx**2 / (6 * eta) if eta > 0 else math.inf
@@ -432,7 +432,7 @@ class _Solver:
         """Equal substeps of the coming frame. Raises ValueError where the user's dt is above the limit, or there are
         more of them than the world allows."""
         now = self.substeps.state(self.current)
-        limit, dt, most = self._limit(now), self.world.dt, self.world.max_substeps
+        limit, dt, most = self._limit(now, self._look(now)), self.world.dt, self.world.max_substeps
         self.remedy = limit.remedy
         last = self.counts[-1] if self.counts else 0
         if dt is not None:
@@ -469,7 +469,7 @@ class _Solver:
     def _health(self, now) -> dict[str, float]:
         """Numbers of one frame for a person to look at; SI. energy counts kinetic, elastic and potential energy."""
         F = now.H.double() + torch.eye(3, dtype=torch.float64, device=now.H.device)
-        J, stretch = torch.linalg.det(F), _extreme_eigenvalues(F.mT @ F)[1].sqrt()
+        J, stretch = _determinant(F), _extreme_eigenvalues(F.mT @ F)[1].sqrt()
         mass, v = self.mass.double(), now.v.double()
         x = self.rest.double() + now.u.double()
         momentum = (mass[:, None] * v).sum(0)
@@ -485,7 +485,7 @@ class _Solver:
         dt = self.frame_dt / self.counts[-1] if self.counts else 0.0
         return {
             "speed_max": speed,
-            "cfl": dt * sum(self._speeds(now)) / self.world.dx,
+            "cfl": dt * sum(self._speeds(self._look(now))) / self.world.dx,
             "J_min": float(J.min()),
             "J_max": float(J.max()),
             "stretch_max": float(stretch.max()),
@@ -512,8 +512,7 @@ class _Solver:
         world, kind = self.world, {"device": self.device, "dtype": self.world.dtype}
         origin = self.setting.position.new_tensor(self.setting.lower)
         cells = (position - origin.to(position.device)) / world.dx
-        self.cell = cells.floor()
-        self.offset = (cells - self.cell).to(**kind)
+        cell = cells.floor()
         self.rest = position.to(**kind)
         self.mass = self.setting.mass.to(position.device)[self.order].to(**kind)
         self.volume = self.mass / world.density
@@ -540,8 +539,8 @@ class _Solver:
             mass=self.mass,
             volume=self.volume,
             rest=self.rest,
-            cell=self.cell.to(torch.int32).contiguous(),
-            offset=self.offset,
+            cell=cell.to(torch.int32).contiguous(),
+            offset=(cells - cell).to(**kind),
             coefficients=coefficients.contiguous(),
             q=q,
             selection=torch.stack(selection)[:, self.order.cpu()].to(**kind) if selection else torch.zeros(0, 0),
@@ -637,13 +636,18 @@ def _sorted_by_cell(position: Tensor, dx: float) -> Tensor:
     return torch.argsort((cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2], stable=True)
 
 
+def _determinant(A: Float[Tensor, "n 3 3"]) -> Float[Tensor, " n"]:
+    """Of small matrices, many at once: torch's takes them one by one."""
+    return (torch.linalg.cross(A[:, 0], A[:, 1]) * A[:, 2]).sum(1)
+
+
 def _extreme_eigenvalues(S: Float[Tensor, "n 3 3"]) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
     """(lowest, highest) eigenvalue of symmetric matrices, in closed form (Smith 1961)."""
     one = torch.eye(3, dtype=S.dtype, device=S.device)
     mean = S.diagonal(dim1=1, dim2=2).mean(1)
     B = S - mean[:, None, None] * one
     p = (B.square().sum((1, 2)) / 6).sqrt().clamp(min=1e-100)
-    angle = torch.acos((torch.linalg.det(B / p[:, None, None]) / 2).clamp(-1, 1)) / 3
+    angle = torch.acos((_determinant(B / p[:, None, None]) / 2).clamp(-1, 1)) / 3
     return mean + 2 * p * torch.cos(angle + 2 * math.pi / 3), mean + 2 * p * torch.cos(angle)
 
 
