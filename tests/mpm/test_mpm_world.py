@@ -10,6 +10,7 @@ from mpm_bodies import block, soft_world, tensors
 
 from physics3d.log import Log
 from physics3d.mpm.boundaries.impulse import Impulse
+from physics3d.mpm.materials.newtonian import Newtonian
 from physics3d.mpm.rollout import Trajectory, rollout
 from physics3d.mpm.world import Estimate
 
@@ -35,6 +36,8 @@ def simulate(world=None, position=POSITION, volume=VOLUME, *, parameters=None, f
         (dict(density=math.nan), "world.density is nan"),
         (dict(gravity=(0.0, math.nan, 0.0)), "world.gravity is"),
         (dict(precision="half"), "world.precision is half"),
+        (dict(scheme="crank"), "world.scheme is crank"),
+        (dict(max_substeps=0), "world.max_substeps is 0"),
         (dict(lower=(0.0, 0.0, 0.0)), "world.lower"),
         (dict(lower=(0.0, 0.0, 0.0), upper=(1.0, 1.0, 0.0)), "world.lower"),
         (dict(start=dict(youngs_modulus=-1.0, poissons_ratio=0.3)), "youngs_modulus is -1"),
@@ -166,3 +169,41 @@ def test_sheet_of_one_particle_is_simulated():
     torch.testing.assert_close(
         trajectory.position[-1].double(), sheet + torch.tensor((0.004, 0.0, 0.012)), atol=1e-6, rtol=0
     )
+
+
+@pytest.mark.parametrize(
+    "changes, says",
+    [
+        (dict(start=dict(youngs_modulus=1e12, poissons_ratio=0.3)), "waves cross a cell .* take a softer material"),
+        (dict(dt=1e-6), "take world.dt > 0.0002, or a larger max_substeps"),
+    ],
+    ids=["stiff", "dt"],
+)
+def test_more_substeps_than_a_frame_may_have_are_refused_before_they_start(changes, says):
+    with pytest.raises(ValueError, match=rf"frame 1 would need \d+ substeps .* world.max_substeps = 100: .*{says}"):
+        simulate(soft_world(max_substeps=100, scheme="explicit", **changes))
+
+
+def test_viscosity_shortens_the_automatic_substep():
+    """Waves alone ask for 0.95 a, with b = rho dx^2/(6 eta) both for 0.95 a [(1 + x^2)^(1/2) - x], x = a/(2 b)."""
+    counts = {}
+    for eta in (0.0, 1e3, 1e4, 1e5):
+        start = dict(bulk_modulus=1e5, viscosity=eta, power_index=1.0)
+        world = soft_world(material=Newtonian(), start=start, scheme="explicit")
+        counts[eta] = simulate(world, frames=2, frame_dt=0.1).substeps
+    a, b = 0.1 / math.sqrt(3 * 1e5 / 1000), {eta: 1000 * 0.01 / (6 * eta) for eta in (1e3, 1e4, 1e5)}
+    assert counts[0.0] == math.ceil(0.1 / min(0.5 * 0.1 / 10, 0.95 * a))
+    for eta, viscous in b.items():
+        x = a / (2 * viscous)
+        limit = 0.95 * a * (math.sqrt(1 + x * x) - x)
+        assert counts[eta] == math.ceil(0.1 / min(0.5 * 0.1 / 10, limit))
+    # ten times the viscosity, ten times the substeps
+    assert counts[1e5] == pytest.approx(10 * counts[1e4], rel=0.02)
+
+
+def test_rejected_substeps_are_counted_and_what_stays_too_fast_is_placed_in_time_and_space():
+    poke = Impulse(force=(1e4, 0.0, 0.0), centre=(0.1, 0.1, 0.1), radius=1.0, start=0.005, duration=0.01)
+    health = simulate(excitation=(poke,), frames=3).health
+    assert sum(health["rejected"]) > 0
+    with pytest.raises(ValueError, match=r"frame 1: particle \d+ at \(.*\) m moves .* cells in a step .* from 0 s on"):
+        simulate(soft_world(scheme="implicit", dt=0.02), excitation=(replace(poke, force=(1e5, 0.0, 0.0)),), frames=3)
