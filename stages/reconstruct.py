@@ -28,7 +28,7 @@ class Reconstruct:
     rates: Rates = field(default_factory=Rates)
     densification: AbstractDensification = field(default_factory=Adaptive)  # where Gaussians are added and removed
     exposure: bool = False  # learn a gain and an offset per photograph and channel; those held out get none
-    floaters: float | None = 3.0  # see gaussians/floaters.py [standard deviations]; null: keep them
+    floaters: float | None = 2.0  # see gaussians/floaters.py [standard deviations]; null: keep them
     check_every: int = 250  # iterations between looks at the held-out photographs
     patience: int = 3  # checks without improvement before it stops early
     seed: int = 0
@@ -88,7 +88,7 @@ class Reconstruct:
         if self.densification.every < 1:
             raise ValueError(f"reconstruct.densification.every is {self.densification.every}; it must be at least 1")
         if self.floaters is not None and not self.floaters > 0:
-            raise ValueError(f"reconstruct.floaters is {self.floaters}; it must be positive, 3 is usual, or null")
+            raise ValueError(f"reconstruct.floaters is {self.floaters}; it must be positive, 2 is usual, or null")
         if self.longest_side < 16:
             raise ValueError(f"reconstruct.longest_side is {self.longest_side} px; it must be at least 16")
         if self.sh_degree not in (0, 1, 2, 3):
@@ -137,6 +137,7 @@ class Reconstruct:
             gray = torch.full_like(points, 0.5)
             colors = gray if capture.point_colors is None else capture.point_colors[pick]
             if not capture.alphas:
-                far, far_colors = background_points(training, points, 1 + len(points) // 4, generator)
+                more = max(1 + len(points) // 4, count // 2 - len(points))
+                far, far_colors = background_points(training, points, more, generator)
                 points, colors = torch.cat([points, far]), torch.cat([colors, far_colors])
         return from_points(points, colors, sh_degree=self.sh_degree)

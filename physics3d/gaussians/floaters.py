@@ -2,7 +2,7 @@
 
 A Gaussian floats if its mean distance to its nearest neighbours is more than `deviations` standard deviations above the
 average of all (Open3D's statistical outlier removal, Rusu et al. 2008), and if no photograph needs it: the sum of its
-blending weights is less than `DRAWN` pixels in each. A filled body would have a particle there. Large ones on plain
+blending weights is less than `DRAWN` pixel in each. A filled body would have a particle there. Large ones on plain
 surfaces are far from their neighbours as well, but they are drawn.
 """
 
@@ -16,7 +16,7 @@ from physics3d.gaussians.rasterize import contribution
 from physics3d.open3d_import import open3d
 
 NEIGHBOURS = 20
-DRAWN = 5.0  # [px]
+DRAWN = 1.0  # [px]
 VISIBLE = 1 / 255  # opacity below which a Gaussian is never drawn
 
 
@@ -26,7 +26,7 @@ def floaters(gaussians: Gaussians, cameras: list[Camera], *, deviations: float) 
     Raises ValueError unless `deviations` > 0.
     """
     if not deviations > 0:
-        raise ValueError(f"floaters: deviations is {deviations}; it must be positive, e.g. 3")
+        raise ValueError(f"floaters: deviations is {deviations}; it must be positive, e.g. 2")
     drawn = torch.nonzero(gaussians.opacity.cpu() >= VISIBLE)[:, 0]
     alone = torch.ones(len(gaussians), dtype=torch.bool)
     if len(drawn) <= NEIGHBOURS:
