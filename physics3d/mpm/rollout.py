@@ -14,8 +14,9 @@ The implicit scheme (`implicit.py`) knows none of these limits. Its automatic st
 moves farther than half a cell in it, or turns or stretches by more than a fifth; a frame whose equations Newton cannot
 solve is done again with twice the steps. scheme="auto" takes it where an explicit frame would be dearer.
 
-Gradients. The exact adjoint of the discrete trajectory: the state is kept at every RUN-th substep, and the reverse pass
-recomputes the substeps in between, run by run, with the same dt and the same windows.
+Gradients. The exact adjoint of the discrete trajectory: the state is kept at every RUN-th substep, or more sparsely if
+world.checkpoint_bytes says so, and the reverse pass recomputes the substeps in between, run by run, with the same dt
+and the same windows.
 """
 
 import math
@@ -31,6 +32,7 @@ from torch import Tensor
 from physics3d.artifact import AbstractArtifact, require_finite
 from physics3d.log import Log
 from physics3d.mpm.boundaries.base import AbstractBoundary, Setting, Vector, mirror_nodes
+from physics3d.mpm.checkpoints import Checkpoints
 from physics3d.mpm.implicit import ImplicitSubsteps, NotConverged
 from physics3d.mpm.substep import Hook, Substeps, start_warp
 from physics3d.mpm.survey import Survey, survey
@@ -154,7 +156,6 @@ class _Run:
     lowest: tuple[int, ...]
     size: tuple[int, ...]
     clock: np.ndarray  # [substeps, k]
-    flat: Tensor | None  # the state before, if gradients are wanted
     node_velocity: Tensor | None = None  # the solution of an implicit step, likewise
 
 
@@ -217,6 +218,8 @@ class _Solver:
         self.initial = first.flat.clone()
         substeps.start(self._clock(0.0, 0.0, 1), 0, 1)
         self.runs: list[list[_Run]] = []
+        most = self.world.checkpoint_bytes
+        self.checkpoints = Checkpoints(None if most is None else max(1, most // first.flat.nbytes))
         self.current = 1
         n, kind = len(position), {"dtype": self.world.dtype, "device": self.device}
         u, deformation = torch.empty((self.frames, n, 3), **kind), torch.empty((self.frames, n, 3, 3), **kind)
@@ -237,11 +240,20 @@ class _Solver:
         substeps.begin_adjoint()
         side = 0
         states = substeps.adjoint["states"]
+        flat_runs = [run for runs in self.runs for run in runs]
+        index = len(flat_runs)
+
+        def replay(k: int) -> None:
+            run = flat_runs[k]
+            substeps.set_window(run.lowest, run.size)
+            substeps.run(run.clock, [0] * (len(run.clock) + 1))
+
         for frame in range(self.frames - 1, 0, -1):
             states[side].u.add_(adjoint_u[frame])
             states[side].H.add_(adjoint_F[frame])
             for run in reversed(self.runs[frame - 1]):
-                substeps.state(0).flat.copy_(run.flat)
+                index -= 1
+                self.checkpoints.recall(index, substeps.state(0).flat, replay)
                 substeps.set_window(run.lowest, run.size)
                 if run.node_velocity is not None:
                     side = self.implicit.reverse(run.clock, 0, 1, side, run.node_velocity)
@@ -259,6 +271,7 @@ class _Solver:
     def _frame(self, frame: int, keep: bool) -> None:
         """From one frame to the next, in equal substeps that obey the limit; more of them if it turns out too fast."""
         start = self.substeps.state(self.current).flat.clone()
+        begun = sum(len(runs) for runs in self.runs)
         self._choose(frame)
         count, reach = self._count(frame), 2.0
         fixed = self.world.dt is not None
@@ -272,6 +285,7 @@ class _Solver:
             except _TooFast as reason:
                 why, remedy = str(reason), reason.remedy
                 self.substeps.state(self.current).flat.copy_(start)
+                self.checkpoints.forget(begun)
                 self.work["rejected"] += 1
                 reach = min(2 * reach, 8.0)
                 if tried == tries or (not fixed and 2 * count > self.world.max_substeps):
@@ -314,7 +328,8 @@ class _Solver:
             lowest, size = self._window(now, 0, dt, 0.0, frame)
             self.substeps.set_window(lowest, size)
             clock = self._clock((frame - 1) * self.frame_dt + done * dt, dt, 1)
-            flat = now.flat.clone() if keep else None
+            if keep:
+                self._checkpoint(len(runs), now, needed=True)
             try:
                 step = self.implicit.step(clock, self.current, 1 - self.current)
             except NotConverged as reason:
@@ -322,7 +337,7 @@ class _Solver:
             self.current = 1 - self.current
             self.work["newton"] += step.newton
             self.work["products"] += step.products
-            runs.append(_Run(lowest, size, clock, flat, step.node_velocity if keep else None))
+            runs.append(_Run(lowest, size, clock, step.node_velocity if keep else None))
             self._inspect(frame, dt, 0)
         return runs
 
@@ -335,12 +350,21 @@ class _Solver:
             lowest, size = self._window(now, steps, dt, reach, frame)
             self.substeps.set_window(lowest, size)
             clock = self._clock((frame - 1) * self.frame_dt + done * dt, dt, steps)
-            runs.append(_Run(lowest, size, clock, now.flat.clone() if keep else None))
+            if keep:
+                self._checkpoint(len(runs), now)
+            runs.append(_Run(lowest, size, clock))
             path = [self.current] * (steps + 1)
             lost = self.substeps.run(clock, path)
             self.work["lost"] += lost
             self._inspect(frame, dt, lost)
         return runs
+
+    def _checkpoint(self, done: int, now, *, needed: bool = False) -> None:
+        """Before the run after `done` others of this frame. Implicit steps are few and not replayed: `needed`, and so
+        is what they lead to."""
+        if not done and self.runs and self.runs[-1][-1].node_velocity is not None:
+            needed = True
+        self.checkpoints.offer(sum(len(runs) for runs in self.runs) + done, now.flat, needed=needed)
 
     def _inspect(self, frame: int, dt: float, lost: int) -> None:
         """After a run: is every number finite, every particle in the region, and every substep short enough?"""

@@ -46,6 +46,7 @@ class World:
     scheme: str = "auto"  # explicit: follows every wave; implicit: damps those faster than dt; auto: the cheaper one
     max_substeps: int = 200_000  # in one frame
     precision: str = "float32"
+    checkpoint_bytes: int | None = None  # for the states that a gradient keeps; less costs time. None: all of them
     lower: Vector | None = None  # corners of the simulated region [m]; None: around the body, with room to move
     upper: Vector | None = None
 
@@ -58,6 +59,8 @@ class World:
         _require(self.dt is None or self.dt > 0, "dt", self.dt, "a time above 0 s, or None")
         _require(self.scheme in SCHEMES, "scheme", self.scheme, f"one of {SCHEMES}")
         _require(self.max_substeps >= 1, "max_substeps", self.max_substeps, "at least 1")
+        enough = self.checkpoint_bytes is None or self.checkpoint_bytes >= 0
+        _require(enough, "checkpoint_bytes", self.checkpoint_bytes, "bytes >= 0, or None")
         _require(self.precision in PRECISIONS, "precision", self.precision, f"one of {tuple(PRECISIONS)}")
         finite = len(self.gravity) == 3 and all(math.isfinite(g) for g in self.gravity)
         _require(finite, "gravity", self.gravity, "three finite numbers [m/s^2]")
