@@ -84,8 +84,9 @@ def test_parts_of_equal_materials_are_one_material():
     options = dict(velocity=velocity, frames=4, frame_dt=0.05, threads=1, log=Log(None))
     one = rollout(alone, tensors(alone.start), body.position, body.volume, **options)
     two = rollout(both, tensors(both.start) | {"part": body.part}, body.position, body.volume, **options)
-    # the same operations in the same order
-    assert torch.equal(one.position, two.position) and torch.equal(one.deformation, two.deformation)
+    # the same operations, up to what the compiler makes of them
+    torch.testing.assert_close(one.position, two.position, rtol=0, atol=1e-12)
+    torch.testing.assert_close(one.deformation, two.deformation, rtol=0, atol=1e-11)
     assert one.health["elastic_energy"] == pytest.approx(two.health["elastic_energy"], rel=1e-12)  # sums over parts
 
 
