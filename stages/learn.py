@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from physics3d.filling import Body
-from physics3d.gaussians.deform import render_deformed
+from physics3d.gaussians.deform import Backdrop, render_deformed
 from physics3d.gaussians.model import Gaussians
 from physics3d.learning.fields import GlobalField
 from physics3d.learning.fit import Chain, fit, physical, polish, search, sensitivity
@@ -156,6 +156,7 @@ class Learn:
         model, embedding = gaussians.to(self.device), body.embedding
         rest, volume = body.position.to(self.device), body.volume.to(self.device)
         background = torch.tensor(capture.background, dtype=torch.float32, device=self.device)
+        backdrops = {i: Backdrop.of(model, embedding, cameras[i], background=background) for i in views}
 
         def simulate(theta: Tensor):
             return rollout(
@@ -173,7 +174,9 @@ class Learn:
 
         def render(motion, view: int, frames: Tensor) -> Tensor:
             draw = lambda x, F: (
-                render_deformed(model, embedding, rest, x, F, cameras[view], background=background).color
+                render_deformed(
+                    model, embedding, rest, x, F, cameras[view], background=background, backdrop=backdrops[view]
+                ).color
             )
             return torch.stack([draw(motion.position[i], motion.deformation[i]) for i in frames.tolist()]).float()
 

@@ -1,12 +1,13 @@
 """Trajectory + Gaussians -> video, seen by the cameras of the recording or by a view of the capture."""
 
+import time
 from dataclasses import dataclass
 
 import torch
 
 from physics3d.filling import Body
 from physics3d.gaussians.cameras import Camera
-from physics3d.gaussians.deform import render_deformed
+from physics3d.gaussians.deform import Backdrop, render_deformed
 from physics3d.gaussians.interior import Interior, paint
 from physics3d.gaussians.model import Gaussians
 from physics3d.log import Log
@@ -41,14 +42,32 @@ class Render:
         inside = self.inside(capture, model, body, trajectory, log) if self.interior else None
         videos: dict[str, list[torch.Tensor]] = {name: [] for name in cameras}
         count = len(trajectory.position)
+        backdrops = {
+            name: Backdrop.of(model, embedding, camera, background=background) for name, camera in cameras.items()
+        }
+
+        def draw(x: torch.Tensor, F: torch.Tensor, name: str, backdrop: Backdrop | None) -> torch.Tensor:
+            with torch.no_grad():
+                drawn = render_deformed(
+                    model, embedding, rest, x, F, cameras[name],
+                    background=background, interior=inside, backdrop=backdrop,
+                )  # fmt: skip
+            return to_uint8(drawn.color)
+
+        spent = 0.0
         for x, F in log.progress(zip(trajectory.position, trajectory.deformation), "render", total=count):
             x, F = x.to(self.device), F.to(self.device)
-            for name, camera in cameras.items():
-                with torch.no_grad():
-                    image = render_deformed(
-                        model, embedding, rest, x, F, camera, background=background, interior=inside
-                    )
-                videos[name].append(to_uint8(image.color))
+            start = time.perf_counter()
+            for name in cameras:
+                videos[name].append(draw(x, F, name, backdrops[name]))
+            spent += time.perf_counter() - start
+        if any(backdrops.values()):
+            start = time.perf_counter()
+            for name in cameras:
+                draw(x, F, name, None)
+            whole = count * (time.perf_counter() - start)
+            static = len(model) - len(embedding.which)
+            log.info(f"{static} static Gaussians drawn once per camera: {spent:.1f} s instead of about {whole:.1f} s")
         frames = {name: torch.stack(images) for name, images in videos.items()}
         for name, video in frames.items():
             write_mp4(log.path(f"{name}.mp4"), video, trajectory.fps)

@@ -21,7 +21,8 @@ from physics3d.artifact import AbstractArtifact, require_finite
 from physics3d.gaussians.cameras import Camera
 from physics3d.gaussians.interior import Interior
 from physics3d.gaussians.model import Gaussians
-from physics3d.gaussians.rasterize import Rendered, rasterize
+from physics3d.gaussians.rasterize import Rendered, rasterize, tiles_of, window
+from physics3d.gaussians.render import render
 from physics3d.gaussians.sh import sh_color
 
 NEIGHBOURS = 8
@@ -150,6 +151,31 @@ def carry(
     return mean.index_copy(0, which, moved), covariance.index_copy(0, which, turned), rotation
 
 
+@dataclass(frozen=True, kw_only=True)
+class Backdrop:
+    """What never moves, drawn once for one camera: a frame draws anew only the tiles that something moving touches."""
+
+    still: Rendered
+    camera: Camera
+
+    @classmethod
+    def of(
+        cls,
+        gaussians: Gaussians,
+        embedding: Embedding,
+        camera: Camera,
+        *,
+        background: Float[Tensor, " 3"] | tuple[float, float, float],
+    ) -> "Backdrop | None":
+        """None where every Gaussian moves."""
+        static = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.mean.device)
+        static[embedding.which.to(static.device)] = False
+        if not static.any():
+            return None
+        with torch.no_grad():
+            return cls(still=render(gaussians.select(static), camera, background=background), camera=camera)
+
+
 def render_deformed(
     gaussians: Gaussians,
     embedding: Embedding,
@@ -160,10 +186,12 @@ def render_deformed(
     *,
     background: Float[Tensor, " 3"] | tuple[float, float, float],
     interior: Interior | None = None,
+    backdrop: Backdrop | None = None,
 ) -> Rendered:
     """Draw the Gaussians where the particles have carried them; differentiable in x, F and the model's appearance.
 
-    Those of the `interior` are drawn where the body has opened.
+    Those of the `interior` are drawn where the body has opened. With a `backdrop` of the same camera the picture is the
+    same, but only the tiles that a moving Gaussian touches are computed, and only what lies there has a gradient.
     """
     mean, covariance, rotation = carry(gaussians, embedding, X, x, F)
     direction = mean - camera.centre.to(mean)
@@ -175,7 +203,17 @@ def render_deformed(
         inner = interior.drawn(X, x)
         if len(inner[0]):
             drawn = tuple(torch.cat([a, b.to(a)]) for a, b in zip(drawn, inner, strict=True))  # type: ignore[assignment]
-    return rasterize(*drawn, camera, background=background)
+    if backdrop is None:
+        return rasterize(*drawn, camera, background=background)
+    moving = torch.zeros(len(drawn[0]), dtype=torch.bool, device=mean.device)
+    moving[embedding.which.to(mean.device)] = True
+    moving[len(gaussians) :] = True
+    tiles = tiles_of(*(a[moving] for a in drawn[:3]), camera)
+    part, place = rasterize(*drawn, camera, background=background, tiles=tiles), window(tiles)
+    whole = {name: getattr(backdrop.still, name).clone() for name in ("color", "alpha", "depth")}
+    for name, picture in whole.items():
+        picture[place] = getattr(part, name)[place]
+    return Rendered(**whole)
 
 
 class _Rotation(torch.autograd.Function):

@@ -37,6 +37,7 @@ from physics3d.gaussians.splatting import ENTRIES, Kernels, Numerics, kernels
 from physics3d.gaussians.splatting import NEAR as NEAR
 
 STANDARD = Numerics()
+Tiles = tuple[int, int, int, int]  # first row of tiles, one past the last; first column, one past the last
 FEW = 4096  # Gaussians below which a second thread costs more than it saves in the projection
 
 
@@ -59,9 +60,11 @@ def rasterize(
     antialiased: bool = False,
     median: bool = False,
     numerics: Numerics = STANDARD,
+    tiles: Tiles | None = None,
 ) -> Rendered:
     """Draw Gaussians with means [m], covariances [m^2], opacities and colours in 0..1. Computes in float32.
 
+    With `tiles`, see `tiles_of`, only those are drawn, as they would be in the whole picture; the rest is background.
     Differentiable in the first four arguments, the background and the camera's pose. Raises ValueError for wrong shapes
     or non-finite numbers.
     """
@@ -70,9 +73,29 @@ def rasterize(
     mean, covariance, opacity, color = (a.to(real) for a in (mean, covariance, opacity, color))
     behind = torch.as_tensor(background).to(mean)
     pose = camera.world_to_camera
-    options = (camera, antialiased, median, numerics)
+    options = (camera, antialiased, median, numerics, tiles)
     picture, alpha, depth, middle = _Splat.apply(mean, covariance, opacity, color, behind, pose, *options)
     return Rendered(color=picture, alpha=alpha, depth=depth, median=_depth_of(middle, mean, pose) if median else None)
+
+
+def tiles_of(
+    mean: Float[Tensor, "n 3"], covariance: Float[Tensor, "n 3 3"], opacity: Float[Tensor, " n"], camera: Camera
+) -> Tiles:
+    """The smallest rectangle of tiles outside of which these Gaussians draw nothing; (0, 0, 0, 0): nothing at all."""
+    arguments = (a.detach().float() for a in (mean, covariance, opacity, torch.zeros_like(mean)))
+    state = _project(*arguments, camera, False, STANDARD, None)
+    across = -(-camera.width // STANDARD.tile)
+    found = torch.nonzero(state.start.diff() > 0)[:, 0]
+    if len(found) == 0:
+        return (0, 0, 0, 0)
+    rows, columns = found // across, found % across
+    return int(rows.min()), int(rows.max()) + 1, int(columns.min()), int(columns.max()) + 1
+
+
+def window(tiles: Tiles) -> tuple[slice, slice]:
+    """Rows and columns of pixels of a rectangle of tiles."""
+    first_row, end_row, first_column, end_column = (STANDARD.tile * i for i in tiles)
+    return slice(first_row, end_row), slice(first_column, end_column)
 
 
 def contribution(
@@ -85,7 +108,9 @@ def contribution(
         )
     with torch.no_grad():
         g = gaussians.to(gaussians.mean.device, torch.float32)
-        state = _project(g.mean, g.covariance(), g.opacity, torch.zeros_like(g.mean), camera, antialiased, STANDARD)
+        state = _project(
+            g.mean, g.covariance(), g.opacity, torch.zeros_like(g.mean), camera, antialiased, STANDARD, None
+        )
         flat = torch.zeros(camera.height, camera.width, device=g.mean.device)
         outputs = [torch.zeros(*flat.shape, 3, device=flat.device), flat, flat, flat]
         weight = []
@@ -146,14 +171,16 @@ def _rows(tensor: Tensor, *shape: int) -> wp.array:
     return _warp(tensor, wp.types.vector(shape[0], real) if len(shape) == 1 else wp.types.matrix(shape, real))
 
 
-def _project(mean, covariance, opacity, color, camera: Camera, antialiased: bool, numerics: Numerics) -> _State:
+def _project(
+    mean, covariance, opacity, color, camera: Camera, antialiased: bool, numerics: Numerics, drawn: Tiles | None
+) -> _State:
     wp.config.log_level = wp.LOG_WARNING
     wp.init()
     n, device = len(mean), mean.device
     mean, covariance, opacity, color = (a.detach().contiguous() for a in (mean, covariance, opacity, color))
     side = 1 if device.type == "cuda" else numerics.tile
     made = kernels(numerics.precision, numerics.tile, side)
-    view = _view(made, camera, antialiased, numerics)
+    view = _view(made, camera, antialiased, numerics, drawn)
     splat = torch.empty(n, ENTRIES, device=device, dtype=mean.dtype)
     depth = torch.empty(2 * n, device=device)  # the second halves are room to sort
     order, count = (torch.empty(m, device=device, dtype=torch.int32) for m in (2 * n, n))
@@ -177,7 +204,7 @@ def _project(mean, covariance, opacity, color, camera: Camera, antialiased: bool
     return _State(mean, covariance, opacity, splat, count, start, gaussian, view, made, numerics.tile)
 
 
-def _view(made: Kernels, camera: Camera, antialiased: bool, numerics: Numerics):
+def _view(made: Kernels, camera: Camera, antialiased: bool, numerics: Numerics, drawn: Tiles | None):
     view = made.View()
     M = camera.world_to_camera.detach().cpu().tolist()
     view.R = [M[i][:3] for i in range(3)]
@@ -185,6 +212,8 @@ def _view(made: Kernels, camera: Camera, antialiased: bool, numerics: Numerics):
     view.fx, view.fy, view.cx, view.cy = camera.fx, camera.fy, camera.cx, camera.cy
     view.width, view.height, view.antialiased = camera.width, camera.height, int(antialiased)
     view.cutoff, view.stop = numerics.cutoff, numerics.stop
+    whole = (0, -(-camera.height // numerics.tile), 0, -(-camera.width // numerics.tile))
+    view.first_row, view.end_row, view.first_column, view.end_column = drawn or whole
     return view
 
 
@@ -278,8 +307,8 @@ def _depth_of(index: Tensor, mean: Tensor, pose: Tensor) -> Tensor:
 
 class _Splat(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, mean, covariance, opacity, color, background, pose, camera, antialiased, median, numerics):
-        ctx.state = state = _project(mean, covariance, opacity, color, camera, antialiased, numerics)
+    def forward(ctx, mean, covariance, opacity, color, background, pose, camera, antialiased, median, numerics, tiles):
+        ctx.state = state = _project(mean, covariance, opacity, color, camera, antialiased, numerics, tiles)
         pictures = _blend(state, background)
         ctx.save_for_backward(*pictures)
         ctx.set_materialize_grads(False)
@@ -306,7 +335,7 @@ class _Splat(torch.autograd.Function):
             background_bar = torch.einsum("hwc,hw->c", color_bar, pictures[3])
         if ctx.needs_input_grad[5]:
             pose_bar = _pose_adjoint(state, mean_bar.double(), covariance_bar.double())
-        return *bars, background_bar, pose_bar, None, None, None, None
+        return *bars, background_bar, pose_bar, None, None, None, None, None
 
 
 def _pose_adjoint(state: _State, mean_bar: Tensor, covariance_bar: Tensor) -> Tensor:

@@ -77,6 +77,10 @@ def _view(real):
         cy: real
         width: int  # [px]
         height: int
+        first_row: int  # of the tiles that are drawn, and one past the last
+        end_row: int
+        first_column: int
+        end_column: int
         antialiased: int  # 1: opacity times sqrt(det / det with the low pass)
         cutoff: real
         stop: real
@@ -100,11 +104,11 @@ def _projection(real, tile: int):
     def tile_rows(s: entry, view: View) -> wp.vec2i:
         """First row of tiles that the ellipse alpha = cutoff touches, and one past the last."""
         reach = wp.sqrt(real(2.0) * wp.log(s[6] / view.cutoff) / s[5]) / STEP
-        n = real((view.height + TILE - 1) // TILE)
+        first, end = real(view.first_row), real(view.end_row)
         v = s[1] / STEP
         return wp.vec2i(
-            int(wp.clamp(wp.floor(v - reach), real(0.0), n)),
-            int(wp.clamp(wp.floor(v + reach) + real(1.0), real(0.0), n)),
+            int(wp.clamp(wp.floor(v - reach), first, end)),
+            int(wp.clamp(wp.floor(v + reach) + real(1.0), first, end)),
         )
 
     @wp.func
@@ -120,11 +124,11 @@ def _projection(real, tile: int):
         left = wp.clamp(-top, d0, d1)
         far = s[0] + s[4] * right + wp.sqrt(wp.max(limit - s[5] * right * right, real(0.0)) / s[3])
         near = s[0] + s[4] * left - wp.sqrt(wp.max(limit - s[5] * left * left, real(0.0)) / s[3])
-        n = real((view.width + TILE - 1) // TILE)
+        first, end = real(view.first_column), real(view.end_column)
         # a little wider, so that rounding loses no pixel
         return wp.vec2i(
-            int(wp.clamp(wp.floor((near - real(0.01)) / STEP), real(0.0), n)),
-            int(wp.clamp(wp.floor((far + real(0.01)) / STEP) + real(1.0), real(0.0), n)),
+            int(wp.clamp(wp.floor((near - real(0.01)) / STEP), first, end)),
+            int(wp.clamp(wp.floor((far + real(0.01)) / STEP) + real(1.0), first, end)),
         )
 
     @wp.kernel(module="unique", enable_backward=False)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from physics3d.gaussians.cameras import Camera, look_at
-from physics3d.gaussians.deform import Embedding, _Rotation, carry, embed, render_deformed
+from physics3d.gaussians.deform import Backdrop, Embedding, _Rotation, carry, embed, render_deformed
 from physics3d.gaussians.model import Gaussians
 from physics3d.gaussians.render import render
 
@@ -193,3 +193,38 @@ def test_bad_arguments_are_refused_with_a_remedy():
         embed(X[:3], which, X, 0.5)
     with pytest.raises(ValueError, match="position_of_gaussians holds 3 non-finite"):
         embed(torch.full((1, 3), float("nan")), which[:1], X, 0.5)
+
+
+def test_a_backdrop_changes_no_pixel_and_no_gradient():
+    """What is reused between frames is what would have been drawn again."""
+    gaussians, X = some_gaussians().to("cpu", torch.float32), lattice(0.2).float()
+    which = torch.arange(5, 9)
+    tied = embed(gaussians.mean[which], which, X, 0.2)
+    camera = Camera(
+        width=100, height=70, fx=90, fy=90, cx=50, cy=35,
+        world_to_camera=look_at(torch.tensor([0.0, -3.0, 0.5]), torch.zeros(3)),
+    )  # fmt: skip
+    background = (0.2, 0.4, 0.6)
+    behind = Backdrop.of(gaussians, tied, camera, background=background)
+    F = STRETCH.float().expand(len(X), 3, 3)
+    weight = torch.rand(70, 100, 3, generator=torch.Generator().manual_seed(1))
+
+    def frame(**more):
+        x = (X @ STRETCH.T.float() * 0.5 + torch.tensor([0.1, 0.0, 0.1])).requires_grad_()
+        drawn = render_deformed(gaussians, tied, X, x, F, camera, background=background, **more)
+        return drawn, torch.autograd.grad((weight * drawn.color).sum(), x)[0]
+
+    (plain, gradient), (reused, same) = frame(), frame(backdrop=behind)
+    assert not torch.equal(behind.still.color, plain.color)
+    for name in ("color", "alpha", "depth"):
+        # colours of static Gaussians come from a viewing direction that is normalised once less: rounding
+        torch.testing.assert_close(getattr(reused, name), getattr(plain, name), rtol=1e-6, atol=1e-6)
+    # the adjoint sums over the tiles in shares of other sizes: rounding of single precision
+    torch.testing.assert_close(same, gradient, rtol=1e-4, atol=1e-5 * float(gradient.abs().max()))
+
+
+def test_without_anything_static_there_is_no_backdrop():
+    gaussians, X = some_gaussians(), lattice(0.2)
+    which = torch.arange(len(gaussians))
+    camera = Camera(width=8, height=8, fx=8, fy=8, cx=4, cy=4, world_to_camera=torch.eye(4, dtype=torch.float64))
+    assert Backdrop.of(gaussians, embed(gaussians.mean, which, X, 0.2), camera, background=(0, 0, 0)) is None
