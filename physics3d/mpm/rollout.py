@@ -256,7 +256,10 @@ class _Solver:
                 self.checkpoints.recall(index, substeps.state(0).flat, replay)
                 substeps.set_window(run.lowest, run.size)
                 if run.node_velocity is not None:
-                    side = self.implicit.reverse(run.clock, 0, 1, side, run.node_velocity)
+                    try:
+                        side = self.implicit.reverse(run.clock, 0, 1, side, run.node_velocity)
+                    except NotConverged as reason:
+                        raise ValueError(f"frame {frame}, gradient: {reason}; take scheme='explicit'") from None
                     continue
                 path = range(len(run.clock) + 1)
                 substeps.run(run.clock, path)

@@ -51,7 +51,7 @@ def test_twenty_times_the_explicit_limit_holds_with_bounded_energy(material, pre
     dt = 20 * lone_limit(world)
     world = dataclasses.replace(world, dt=dt)
     velocity = 0.3 * (position / DX) ** 2 / 16 + shaken(len(position), 0.1)
-    health = simulate(world, position, volume, frames=21, frame_dt=dt, velocity=velocity).health
+    health = simulate(world, position, volume, frames=13, frame_dt=dt, velocity=velocity).health
     energy = torch.tensor(health["energy"])
     # backward Euler takes energy out and never adds any; the transfers neither
     rounding = 1e-3 if precision == "float32" else 1e-6
@@ -189,9 +189,9 @@ def make_loss(world, *, frame_dt: float, speed: float, excitation=()):
 
 @pytest.mark.parametrize("boundary", every_boundary(), ids=lambda b: f"{type(b).__name__}-{getattr(b, 'kind', '')}")
 def test_adjoint_is_the_derivative_through_every_boundary(boundary):
-    """With an impulse, gravity and damping, two steps a frame of six times the explicit limit."""
+    """With an impulse, gravity and damping, steps of twelve times the explicit limit."""
     start = dict(youngs_modulus=1e6, poissons_ratio=0.3)
-    world = soft_world(scheme="implicit", dt=0.01, damping=0.5, gravity=(0.0, 0.0, -9.81), start=start)
+    world = soft_world(scheme="implicit", dt=0.02, damping=0.5, gravity=(0.0, 0.0, -9.81), start=start)
     loss, inputs = make_loss(world, frame_dt=0.02, speed=0.1, excitation=(boundary,))
     compare(loss, inputs | {"force": torch.tensor(PUSH.force)})
 
