@@ -6,12 +6,11 @@ import numpy as np
 import torch
 
 from physics3d.gaussians.model import Gaussians
-from physics3d.gaussians.rasterize import rasterize
 from physics3d.gaussians.render import render
 from physics3d.log import Log
 from physics3d.scenes.base import Capture
 from physics3d.segmentation import Segmentation
-from physics3d.segmentation.lift import contributions, islands, lift, touching
+from physics3d.segmentation.lift import contributions, islands, lift, shares, touching
 from physics3d.segmentation.masks import AbstractMasker, GrabCut
 from physics3d.segmentation.previews import contact_sheet, tinted
 from physics3d.segmentation.prompts import (
@@ -22,6 +21,7 @@ from physics3d.segmentation.prompts import (
     mask_of_box,
     prompted_mask,
     refined_mask,
+    told_apart,
     within_any,
 )
 
@@ -49,7 +49,7 @@ class Segment:
         if capture.images:
             said, rooms = self._prompted(capture, gaussians, parts)
             every = self._views(capture, gaussians, said, rooms, log)
-            views, maps = self._maps(capture, every, parts, said, rooms, log)
+            views, maps = self._maps(capture, gaussians, every, parts, said, rooms, log)
             label = self._lift(gaussians, views, maps, parts, rooms)
             for _ in range(self.rounds if self.prompts else 0):
                 views, maps = every, self._refine(gaussians, label, every, parts, rooms, capture, log)
@@ -98,31 +98,35 @@ class Segment:
                 f"segment.prompts is empty and {capture.name} has no mattes; say what moves, e.g. "
                 "prompts=[{view: 0, box: [0.3, 0.2, 0.7, 0.8]}] in fractions of width and height"
             )
-        said, rooms = {}, {}
+        said: dict[str, tuple[View, np.ndarray]] = {}
         in_image = [(p, _index(capture, p.view)) for p in self.prompts if p.in_image]
-        for part in parts:
-            where = {index for p, index in in_image if p.part == part}
-            if not where:
-                continue
-            if len(where) > 1:
-                raise ValueError(f"the prompts of {part!r} are in several views; give those of one part in one view")
-            view = self._view(capture, gaussians, where.pop())
-            here = [p for p, index in in_image if index == view.index]
-            own, others = (tuple(p for p in here if (p.part == part) == same) for same in (True, False))
-            mask = prompted_mask(own, others, view, self.masker)
-            rooms[part] = Room.around(view, mask, tuple(p for p in self.prompts if p.part == part))
-            said[part] = view, mask
+        for index in dict.fromkeys(index for _, index in in_image):
+            view, here = self._view(capture, gaussians, index), [p for p, i in in_image if i == index]
+            masks = {}
+            for part in dict.fromkeys(p.part for p in here):
+                if part in said:
+                    raise ValueError(
+                        f"the prompts of {part!r} are in several views; give those of one part in one view"
+                    )
+                own, others = (tuple(p for p in here if (p.part == part) == same) for same in (True, False))
+                masks[part] = prompted_mask(own, others, view, self.masker)
+            said |= {part: (view, mask) for part, mask in told_apart(masks, view, self.masker).items()}
+        said = {part: said[part] for part in parts if part in said}
+        rooms = {
+            part: Room.around(view, mask, tuple(p for p in self.prompts if p.part == part))
+            for part, (view, mask) in said.items()
+        }
         return said, rooms
 
     def _maps(
-        self, capture: Capture, views: list[View], parts: tuple[str, ...], said, rooms: dict[str, Room], log: Log
+        self, capture: Capture, gaussians: Gaussians, views: list[View], parts, said, rooms: dict[str, Room], log: Log
     ) -> tuple[list[View], list[torch.Tensor]]:
         """The views that could be masked, and for each a map of labels [h, w]."""
         masks: dict[str, dict[int, np.ndarray]] = {}
         for part in parts:
             own = tuple(p for p in self.prompts if p.part == part)
             if part in said:
-                masks[part] = carry_masks(*said[part], rooms[part], views, self.masker, log=log)  # type: ignore[arg-type, call-arg, misc]
+                masks[part] = carry_masks(gaussians, *said[part], rooms[part], views, self.masker, log=log)  # type: ignore[arg-type, call-arg, misc]
             elif own:
                 found = {v.index: mask_of_box(own[0], v, self.masker) for v in log.progress(views, "masking the box")}
                 masks[part] = {i: m for i, m in found.items() if m is not None}
@@ -159,24 +163,14 @@ class Segment:
         """Maps again, each view now masked by what all views together say."""
         maps = []
         for view in log.progress(views, "refining masks"):
-            shares = self._shares(gaussians, label, len(parts), view)
+            drawn = shares(gaussians, label, len(parts), view.camera)
             masks = []
-            for part, share in zip(parts, shares):
+            for part, share in zip(parts, drawn):
                 mask = refined_mask(share, view, rooms.get(part), self.masker)
                 # where two parts meet, both outlines are guesses: a pixel is of the one that shows there
-                masks.append(mask & (share >= shares.max(0) - 1e-6) if len(parts) > 1 else mask)
+                masks.append(mask & (share >= drawn.max(0) - 1e-6) if len(parts) > 1 else mask)
             maps.append(_labelled(masks, view, capture))
         return maps
-
-    def _shares(self, gaussians: Gaussians, label: torch.Tensor, count: int, view: View) -> np.ndarray:
-        """Share of each pixel that the Gaussians of each label 1..count contribute, [count, h, w]."""
-        shape, shares = gaussians.covariance(), []
-        one_hot = torch.nn.functional.one_hot(label.long(), 1 + -(-count // 3) * 3)[:, 1:].to(gaussians.mean)
-        for three in one_hot.split(3, 1):
-            with torch.no_grad():
-                drawn = rasterize(gaussians.mean, shape, gaussians.opacity, three, view.camera, background=(0, 0, 0))
-            shares.append(drawn.color.permute(2, 0, 1).cpu())
-        return torch.cat(shares)[:count].numpy()
 
     def _views(self, capture: Capture, gaussians: Gaussians, said, rooms: dict[str, Room], log: Log) -> list[View]:
         """The prompted views, and training photographs that show the parts whole, spread by farthest camera."""

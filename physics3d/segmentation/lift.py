@@ -17,7 +17,7 @@ from torch import Tensor
 
 from physics3d.gaussians.cameras import Camera
 from physics3d.gaussians.model import Gaussians
-from physics3d.gaussians.rasterize import contribution
+from physics3d.gaussians.rasterize import contribution, rasterize
 
 NEGLIGIBLE = 0.3  # [px] summed over views
 NEIGHBOURS = 8
@@ -48,6 +48,19 @@ def lift(mean: Float[Tensor, "n 3"], weights: Float[Tensor, "n count"]) -> Int[T
         votes = torch.nn.functional.one_hot(label[known][torch.from_numpy(near)], weights.shape[1]).sum(1)
         label[~shown] = votes.argmax(1)
     return label.to(torch.int32)
+
+
+def shares(
+    gaussians: Gaussians, label: Int[Tensor, " n"], count: int, camera: Camera
+) -> Float[np.ndarray, "count h w"]:
+    """Share of each pixel (0..1) that the Gaussians of each label 1..count contribute."""
+    covariance, drawn = gaussians.covariance(), []
+    one_hot = torch.nn.functional.one_hot(label.long(), 1 + -(-count // 3) * 3)[:, 1:].to(gaussians.mean)
+    for three in one_hot.split(3, 1):
+        with torch.no_grad():
+            picture = rasterize(gaussians.mean, covariance, gaussians.opacity, three, camera, background=(0, 0, 0))
+        drawn.append(picture.color.permute(2, 0, 1).cpu())
+    return torch.cat(drawn)[:count].numpy()
 
 
 def islands(

@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 
 from physics3d.priors.weights import hub_answers
-from physics3d.segmentation.pixels import bounds, centres, depth_in, eroded, thinned
+from physics3d.segmentation.pixels import bounds, centres, depth_in, eroded, size_of, thinned
 
 SURE = 0.95  # share of a pixel above which it is the object's, and 1 - SURE below which it is not
 
@@ -89,7 +89,7 @@ class GrabCut(AbstractMasker):
         return without_specks(connected_to(closed.astype(bool), positive))
 
     def refine(self, image, share):
-        """The outline is cut in a band about the guess, an eighth of the object wide, so that thin things return."""
+        """The outline is cut in a band about the guess, a tenth of the object wide, so that thin things return."""
         import cv2
 
         guess = share > 0.5
@@ -97,7 +97,7 @@ class GrabCut(AbstractMasker):
             return guess
         kinds = np.where(guess, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
         kinds[(share > SURE) & (depth_in(guess) > 2)] = cv2.GC_FGD
-        kinds[(share < 1 - SURE) & (depth_in(~guess) > max(4, 0.12 * guess.sum() ** 0.5))] = cv2.GC_BGD
+        kinds[(share < 1 - SURE) & (depth_in(~guess) > max(4, 0.1 * size_of(guess)))] = cv2.GC_BGD
         left, top, right, bottom = bounds(centres(guess), 0.5, guess.shape, share=1.0).astype(int)
         mask = cut(image, kinds, (slice(top, bottom), slice(left, right)), self.iterations)
         return mask | (without_specks(mask) & guess)

@@ -31,10 +31,10 @@ def depth_in(mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     return ndimage.distance_transform_edt(np.pad(mask, 1, mode="edge"))[1:-1, 1:-1]
 
 
-def share_within(mask: Bool[np.ndarray, "h w"], uv: Float[np.ndarray, "m 2"]) -> float:
-    """Share of the points [px], all in the image, that lie on the mask."""
-    u, v = np.floor(uv).astype(int).T
-    return float(mask[v, u].mean()) if len(uv) else 0.0
+def size_of(mask: Bool[np.ndarray, "h w"]) -> float:
+    """Geometric mean of width and height of the pixels' bounding box [px]; of an object with thin limbs, its reach."""
+    rows, columns = (np.flatnonzero(mask.any(k)) for k in (1, 0))
+    return float(np.sqrt((1 + np.ptp(rows)) * (1 + np.ptp(columns)))) if len(rows) else 0.0
 
 
 def thinned(points, most: int):

@@ -1,10 +1,10 @@
-"""What a person says about one photograph, carried to the others through rendered depth.
+"""What a person says about one photograph, carried to the others through the Gaussians.
 
-The masked pixels of the prompted view become points of the object, X = o + z(u, v) d(u, v) [m]; projected into the next
-view they give a box and, where the rendered depth there says that they are visible, positive points; the pixels
-around the object give negative ones in the same way. Views are taken in the order of their angle to the prompted
-one, and each adds the points that it shows, so that the far side is reached step by step. What is farther
-behind the prompted view's surface than the object is wide is never part of it: prompt a view that shows it large.
+The mask of the prompted photograph labels the Gaussians that it shows (see `lift`), and unseen ones take the label of
+their neighbours. Drawn from the next camera these labels say of every pixel which share is the object's, and the masker
+finds the outline near there. Views are taken in the order of their angle to the prompted one, and each adds what it
+shows, so that the far side is reached step by step. What is farther behind the prompted view's surface than the object
+is wide is never part of it: prompt a view that shows it large.
 """
 
 from dataclasses import dataclass
@@ -15,14 +15,14 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from physics3d.gaussians.cameras import Camera
+from physics3d.gaussians.model import Gaussians
 from physics3d.gaussians.rasterize import Rendered
 from physics3d.log import Log
+from physics3d.segmentation.lift import contributions, lift, shares
 from physics3d.segmentation.masks import AbstractMasker, AbstractVideoMasker
-from physics3d.segmentation.pixels import bounds, centres, eroded, share_within, thinned
+from physics3d.segmentation.pixels import centres, eroded, size_of, thinned
 
-DEPTH_TOLERANCE = 0.03  # of the depth: farther behind the rendered surface a point is hidden
-MOST_CARRIED = 20_000  # points of each sign
-LEAST_REFINED = 20  # pixels; a part that shows less in a view is not looked for there
+LEAST_SHOWN = 20  # pixels; a part that shows less in a view is not looked for there
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,22 +96,10 @@ class View:
         origin, direction = self.camera.rays()
         return origin + self.rendered.depth[chosen][:, None] * direction[chosen]
 
-    def sees(self, point: Float[Tensor, "m 3"]) -> tuple[Float[np.ndarray, "m 2"], Bool[np.ndarray, " m"]]:
-        """Pixel coordinates of points [m], and which of them are in the image and in front of everything else."""
-        uv, depth = self.camera.project(point)
-        pixel = uv.floor().long()
-        inside = (
-            (depth > 0) & (pixel >= 0).all(1) & (pixel[:, 0] < self.camera.width) & (pixel[:, 1] < self.camera.height)
-        )
-        at = torch.where(inside[:, None], pixel, 0)
-        surface, opaque = self.rendered.depth[at[:, 1], at[:, 0]], self.rendered.alpha[at[:, 1], at[:, 0]] > 0.5
-        seen = inside & opaque & (depth < (1 + DEPTH_TOLERANCE) * surface)
-        return uv.numpy(), seen.numpy()
-
 
 @dataclass(frozen=True)
 class Room:
-    """Space that the object may take: a box along the axes of a view that shows it, as deep as it is wide and high."""
+    """Space that the object may take: a box along the axes of a view that shows it, as deep as it is wide or high."""
 
     world_to_camera: Float[Tensor, "4 4"]
     lower: Float[Tensor, " 3"]  # in the camera's axes [m]
@@ -135,9 +123,10 @@ class Room:
         M = view.camera.world_to_camera.to(visible)
         local = lambda point: (point @ M[:3, :3].T + M[:3, 3]).numpy()
         low, high = np.quantile(local(silhouette), (0.005, 0.995), axis=0)
-        size = (high - low)[:2].mean()
+        size = (high - low)[:2].max()
         low[2] = np.quantile(local(visible)[:, 2], 0.02)  # outlines, whose depths mix, say nothing of this
         high[2] = low[2] + size
+        low[2] -= 0.4 * size  # thin things that reach towards the camera are too few to show in that
         low, high = (torch.from_numpy(v).to(visible) for v in (low - size / 8, high + size / 8))
         return cls(M, low, high, boxes)
 
@@ -192,56 +181,70 @@ def prompted_mask(prompts: tuple[Prompt, ...], others: tuple[Prompt, ...], view:
     return mask
 
 
+def told_apart(
+    masks: dict[str, Bool[np.ndarray, "h w"]], view: View, masker: AbstractMasker
+) -> dict[str, Bool[np.ndarray, "h w"]]:
+    """Parts prompted in one view, again: what only one of them claims teaches the masker what the others are not."""
+    claims = np.sum(list(masks.values()), axis=0)
+    again = {}
+    for part, mask in masks.items():
+        share = np.where(mask, np.where(claims > 1, 0.5, 1.0), 0.0)
+        # a part that lies wholly on another has nothing of its own to learn from
+        own = (share == 1).sum() > 0.3 * mask.sum()
+        again[part] = masker.refine(view.image, share) if own and (claims > 1).any() else mask
+    return again
+
+
 def carry_masks(
-    first: View, mask: Bool[np.ndarray, "h w"], room: Room, views: list[View], masker: AbstractMasker, *, log: Log
+    gaussians: Gaussians,
+    first: View,
+    mask: Bool[np.ndarray, "h w"],
+    room: Room,
+    views: list[View],
+    masker: AbstractMasker,
+    *,
+    log: Log,
 ) -> dict[int, Bool[np.ndarray, "h w"]]:
-    """Masks by view index: the first one, and those of the other views that agree with the points carried to them."""
+    """Masks by view index: the first one, and those of the other views that agree with what was carried to them."""
     mask = mask & ~room.excludes(first)
     masks = {first.index: mask}
-    inside, outside = first.points(eroded(mask, 2)), first.points(eroded(~mask, 2))
-    inside, outside = thinned(inside, MOST_CARRIED), thinned(outside, MOST_CARRIED)
     followed: dict[int, np.ndarray] = {}
     if isinstance(masker, AbstractVideoMasker):
         path = along_path(first, views)
         start = next(k for k, v in enumerate(path) if v.index == first.index)
         followed = dict(zip([v.index for v in path], masker.follow([v.image for v in path], start, mask)))
+    mean = gaussians.mean.cpu()
+    allowed = room.holds(mean)
+    said = lambda view: contributions(gaussians, [view.camera], [torch.from_numpy(masks[view.index]).long()], 2)
+    weights = said(first)
     towards = lambda view: torch.nn.functional.normalize(view.camera.centre.to(room.centre) - room.centre, dim=0)
     order = sorted((v for v in views if v.index != first.index), key=lambda v: -float(towards(v) @ towards(first)))
     for view in log.progress(order, "carrying the prompt"):
-        uv, seen = view.sees(inside)
-        if seen.sum() < 0.05 * len(inside):
+        (share,) = shares(gaussians, lift(mean, weights) * allowed, 1, view.camera)
+        guess = share > 0.5
+        if guess.sum() < LEAST_SHOWN:
             log.info(f"{view.name} hardly shows the object, left out")
             continue
-        # the side that no view has shown yet may stick out
-        box = bounds(uv[seen], 0.3, view.image.shape)
-        around, clear = view.sees(outside)
-        clear &= ((around >= box[:2]) & (around <= box[2:])).all(1)
-        beyond = room.excludes(view)
-        if view.index in followed:
-            found = followed[view.index] & ~beyond
-        else:
-            pixels = centres(beyond)
-            pixels = pixels[((pixels >= box[:2]) & (pixels <= box[2:])).all(1)]
-            found = masker(
-                view.image,
-                box=box,
-                positive=thinned(uv[seen], masker.most_points),
-                negative=np.concatenate([thinned(p, masker.most_points // 2) for p in (around[clear], pixels)]),
-            )
-            found &= ~beyond
-        recall, leak = share_within(found, uv[seen]), share_within(found, around[clear])
-        if recall < 0.6 or leak > 0.3:
-            log.info(
-                f"{view.name}: the mask holds {100 * recall:.0f} % of the object's points "
-                f"and {100 * leak:.0f} % of those around it, left out"
-            )
+        found = followed[view.index] if followed else masker.refine(view.image, share)
+        found &= ~clearly_outside(room, view, guess)
+        agreement = overlap(found, guess)
+        if agreement < 0.5:
+            log.info(f"{view.name}: the mask overlaps what other views say by {100 * agreement:.0f} %, left out")
             continue
         masks[view.index] = found
-        inside = thinned(torch.cat([inside, view.points(eroded(found, 2))]), MOST_CARRIED)
-        # what this mask may have missed lies next to it, and must not become negative in the next view
-        clear_of_it = eroded(~found, 2 + round(0.15 * found.sum() ** 0.5))
-        outside = thinned(torch.cat([outside, view.points(clear_of_it)]), MOST_CARRIED)
+        weights += said(view)
     return masks
+
+
+def clearly_outside(room: Room, view: View, guess: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Pixels well inside the area that shows what is outside the room: where thin things end, depth is a mix."""
+    return eroded(room.excludes(view), 0.06 * size_of(guess))
+
+
+def overlap(a: Bool[np.ndarray, "h w"], b: Bool[np.ndarray, "h w"]) -> float:
+    """Intersection over union; 1 for two empty masks."""
+    union = (a | b).sum()
+    return float((a & b).sum() / union) if union else 1.0
 
 
 def along_path(first: View, views: list[View]) -> list[View]:
@@ -265,16 +268,15 @@ def refined_mask(
 ) -> Bool[np.ndarray, "h w"]:
     """Mask of a part from its own labels: `share` of each pixel that Gaussians labelled with it contribute.
 
-    A mask that contradicts the labels is replaced by them. Outside its room the part cannot be, but where thin things
-    end depth is a mix with what lies behind: that rules out only what is well outside.
+    A mask that contradicts the labels is replaced by them.
     """
     guess = share > 0.5
-    if guess.sum() < LEAST_REFINED:
+    if guess.sum() < LEAST_SHOWN:
         return np.zeros_like(guess)
     mask = masker.refine(view.image, share)
     if room is not None:
-        mask &= ~eroded(room.excludes(view), 0.08 * guess.sum() ** 0.5)
-    return mask if (mask & guess).sum() > 0.6 * (mask | guess).sum() else guess
+        mask &= ~clearly_outside(room, view, guess)
+    return mask if overlap(mask, guess) > 0.6 else guess
 
 
 def mask_of_box(prompt: Prompt, view: View, masker: AbstractMasker) -> Bool[np.ndarray, "h w"] | None:
