@@ -12,7 +12,8 @@ frame that turns out too fast for them is done again with more, up to world.max_
 
 The implicit scheme (`implicit.py`) knows none of these limits. Its automatic step is the whole frame, unless a particle
 moves farther than half a cell in it, or turns or stretches by more than a fifth; a frame whose equations Newton cannot
-solve is done again with twice the steps. scheme="auto" takes it where an explicit frame would be dearer.
+solve is done again with twice the steps. It damps whatever swings faster than a few steps, so it is another answer and
+not only a cheaper one: scheme="auto" takes it where the explicit substep is below 1/24 s / WORTH = 4e-5 s.
 
 Gradients. The exact adjoint of the discrete trajectory: the state is kept at every RUN-th substep, or more sparsely if
 world.checkpoint_bytes says so, and the reverse pass recomputes the substeps in between, run by run, with the same dt
@@ -46,6 +47,7 @@ TRIES = 6  # of one frame, each with twice the substeps
 # float32, 12800 particles of a clamped block at 30 to 3000 explicit substeps per step: it costs 160 to 380 of them. By
 # less than a factor of three it is not worth the vibrations that backward Euler damps.
 WORTH = 1000
+LONGEST = 1 / 24  # [s], of an implicit step of the automatic scheme: frames may be further apart than a film's
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -454,11 +456,13 @@ class _Solver:
         return math.ceil(self.frame_dt / min(self.world.cfl * limit.crossing, 0.95 * limit.alone))
 
     def _implicit_need(self, now) -> int:
-        """Implicit steps that a frame needs: no particle moves half a cell, turns or stretches by a fifth."""
+        """Implicit steps that a frame needs: no particle moves half a cell, turns or stretches by a fifth in one; and if
+        it is not the user who wants them, none is longer than a frame of a film."""
         gain = math.hypot(*self.world.gravity) * self.frame_dt
         speed = (float(now.v.norm(dim=1).max()) + gain) / (0.5 * self.world.dx)
         rate = float(now.L.flatten(1).norm(dim=1).max()) / 0.2
-        return max(1, math.ceil(self.frame_dt * max(speed, rate)))
+        film = 1 / LONGEST if self.world.scheme == "auto" else 0.0
+        return max(1, math.ceil(self.frame_dt * max(speed, rate, film) * (1 - 1e-9)))
 
     def _count(self, frame: int) -> int:
         """Equal substeps of the coming frame. Raises ValueError where the user's dt is above the limit, or there are
