@@ -32,6 +32,7 @@ from torch import Tensor
 
 from physics3d.artifact import AbstractArtifact, require_finite
 from physics3d.log import Log
+from physics3d.mpm import spectral
 from physics3d.mpm.boundaries.base import AbstractBoundary, Setting, Vector, mirror_nodes
 from physics3d.mpm.checkpoints import Checkpoints
 from physics3d.mpm.implicit import ImplicitSubsteps, NotConverged
@@ -213,16 +214,16 @@ class _Solver:
         substeps = self._build(coefficients, q, position)
         self.substeps, self.coefficients = substeps, coefficients
         self.modulus = self.world.material.wave_modulus(coefficients)
-        first, now = substeps.state(0), substeps.state(1)
+        first = substeps.state(0)
         first.memory.copy_(self.world.material.initial_memory(len(position), self.world.dtype))
         first.v_gathered.copy_(velocity)
         first.L_gathered.copy_(gradient)
-        self.initial = first.flat.clone()
-        substeps.start(self._clock(0.0, 0.0, 1), 0, 1)
+        self.initial = first.flat.clone() if keep else None
+        substeps.start(self._clock(0.0, 0.0, 1), 0, 0)
         self.runs: list[list[_Run]] = []
         most = self.world.checkpoint_bytes
         self.checkpoints = Checkpoints(None if most is None else max(1, most // first.flat.nbytes))
-        self.current = 1
+        self.current = 0
         n, kind = len(position), {"dtype": self.world.dtype, "device": self.device}
         u, deformation = torch.empty((self.frames, n, 3), **kind), torch.empty((self.frames, n, 3, 3), **kind)
         eye = torch.eye(3, **kind)
@@ -507,7 +508,7 @@ class _Solver:
     def _health(self, now) -> dict[str, float]:
         """Numbers of one frame for a person to look at; SI. energy counts kinetic, elastic and potential energy."""
         F = now.H.double() + torch.eye(3, dtype=torch.float64, device=now.H.device)
-        J, stretch = _determinant(F), _extreme_eigenvalues(F.mT @ F)[1].sqrt()
+        J, stretch = spectral.determinant(F), spectral.principal_values(F.mT @ F)[2].sqrt()
         mass, v = self.mass.double(), now.v.double()
         x = self.rest.double() + now.u.double()
         momentum = (mass[:, None] * v).sum(0)
@@ -674,21 +675,6 @@ def _sorted_by_cell(position: Tensor, dx: float) -> Tensor:
     return torch.argsort((cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2], stable=True)
 
 
-def _determinant(A: Float[Tensor, "n 3 3"]) -> Float[Tensor, " n"]:
-    """Of small matrices, many at once: torch's takes them one by one."""
-    return (torch.linalg.cross(A[:, 0], A[:, 1]) * A[:, 2]).sum(1)
-
-
-def _extreme_eigenvalues(S: Float[Tensor, "n 3 3"]) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
-    """(lowest, highest) eigenvalue of symmetric matrices, in closed form (Smith 1961)."""
-    one = torch.eye(3, dtype=S.dtype, device=S.device)
-    mean = S.diagonal(dim1=1, dim2=2).mean(1)
-    B = S - mean[:, None, None] * one
-    p = (B.square().sum((1, 2)) / 6).sqrt().clamp(min=1e-100)
-    angle = torch.acos((_determinant(B / p[:, None, None]) / 2).clamp(-1, 1)) / 3
-    return mean + 2 * p * torch.cos(angle + 2 * math.pi / 3), mean + 2 * p * torch.cos(angle)
-
-
 def _isolated(position: Tensor, dx: float) -> int:
     """Particles with no other particle in their own cell or the 26 around it."""
     cell = (position / dx).floor().long()
@@ -699,7 +685,8 @@ def _isolated(position: Tensor, dx: float) -> int:
     alone = occupied[count == 1]
     lonely = torch.ones(len(alone), dtype=torch.bool, device=alone.device)
     for step in _neighbours(int(size[1]), int(size[2])):
-        lonely &= ~torch.isin(alone + step, occupied)
+        at = torch.searchsorted(occupied, alone + step).clamp(max=len(occupied) - 1)
+        lonely &= occupied[at] != alone + step
     return int(lonely.sum())
 
 

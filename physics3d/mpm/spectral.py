@@ -16,7 +16,10 @@ function with one adjoint, and marked `without_replay`.
 import functools
 import math
 
+import torch
 import warp as wp
+from jaxtyping import Float
+from torch import Tensor
 
 
 def matrix_type(real: type) -> type:
@@ -786,3 +789,43 @@ def box_hencky(real: type) -> wp.Function:
         wp.adjoint[X] += Q * (T * Qt)
 
     return box
+
+
+def determinant(A: Float[Tensor, "n 3 3"]) -> Float[Tensor, " n"]:
+    """Of many matrices at once, which torch takes one by one."""
+    return (torch.linalg.cross(A[:, 0], A[:, 1]) * A[:, 2]).sum(1)
+
+
+def principal_values(S: Float[Tensor, "n 3 3"]) -> tuple[Float[Tensor, " n"], ...]:
+    """(lowest, middle, highest) of many symmetric matrices at once, in closed form (Smith 1961).
+
+    Near equal ones single values are known to half of the digits only; symmetric functions of the three to all."""
+    one = torch.eye(3, dtype=S.dtype, device=S.device)
+    mean = S.diagonal(dim1=1, dim2=2).mean(1)
+    B = S - mean[:, None, None] * one
+    p = (B.square().sum((1, 2)) / 6).sqrt()
+    r = determinant(B / p.clamp(min=torch.finfo(S.dtype).tiny ** 0.5)[:, None, None]) / 2
+    angle = torch.acos(r.clamp(-1, 1)) / 3
+    low, high = mean + 2 * p * torch.cos(angle + 2 * math.pi / 3), mean + 2 * p * torch.cos(angle)
+    return low, 3 * mean - low - high, high
+
+
+def stretch_distance(H: Float[Tensor, "n 3 3"]) -> Float[Tensor, " n"]:
+    """sum (s_i - 1)^2 over the signed singular values of I + H, without cancellation: tr E - 2 e.
+
+    E = F^T F - I, and e = tr U - 3 belongs to the largest root of the quartic whose roots are s_1 +- s_2 +- s_3; Newton
+    comes to it from above."""
+    E = H + H.mT + H.mT @ H
+    tr = E.diagonal(dim1=1, dim2=2).sum(1)
+    second = (tr.square() - E.square().sum((1, 2))) / 2
+    h = H.diagonal(dim1=1, dim2=2).sum(1)
+    j = h + (h.square() - (H * H.mT).sum((1, 2))) / 2 + determinant(H)  # J - 1
+    e = tr / ((1 + tr / 3).clamp(min=0).sqrt() + 1)  # of equal stretches: the upper bound
+    for _ in range(60):
+        g = (6 * e + e.square() - tr) / 2  # sum of products of two stretches, minus 3
+        slope = (6 + 2 * g) * (3 + e) - 2 * (1 + j)
+        step = (6 * g + g.square() - 2 * tr - second - 2 * (e + 3 * j + j * e)) / slope.clamp(min=1e-30)
+        e = e - step
+        if not bool((step.abs() > torch.finfo(H.dtype).eps * (e.abs() + tr.abs())).any()):
+            break
+    return tr - 2 * e

@@ -139,3 +139,21 @@ def test_log1p_and_expm1_keep_the_digits_of_small_numbers(real):
     scalars = evaluate(real, H, 0 * H)[4]
     np.testing.assert_allclose(scalars[:, 1], np.log1p(x.astype(np.float64)), rtol=TOLERANCE[real], atol=0)
     np.testing.assert_allclose(scalars[:, 2], np.expm1(x.astype(np.float64)), rtol=TOLERANCE[real], atol=0)
+
+
+@pytest.mark.parametrize("size", [1e-4, 0.3, 2.0])
+def test_closed_forms_for_many_matrices_agree_with_torch(size):
+    """Determinant, principal values and sum (s - 1)^2 of signed stretches, inverted ones included."""
+    H = size * torch.randn(500, 3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    H[:3] = torch.stack([torch.zeros(3, 3), 0.1 * torch.eye(3), torch.diag(torch.tensor([0.2, 0.2, -0.1]))])
+    F = torch.eye(3, dtype=torch.float64) + H
+    torch.testing.assert_close(spectral.determinant(F), torch.linalg.det(F), rtol=1e-12, atol=1e-12)
+    S = F.mT @ F
+    # equal values: half of the digits
+    torch.testing.assert_close(
+        torch.stack(spectral.principal_values(S), 1), torch.linalg.eigvalsh(S), rtol=1e-7, atol=1e-7
+    )
+    U, s, Vt = torch.linalg.svd(F)
+    s[:, 2] *= torch.linalg.det(U @ Vt)
+    expected = ((s - 1) ** 2).sum(1)
+    torch.testing.assert_close(spectral.stretch_distance(H), expected, rtol=1e-9, atol=1e-9 * size**2)

@@ -127,12 +127,11 @@ def store_strain(real: type) -> wp.Function:
 def log_strain(memory: Float[Tensor, "6 n"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
     """Stored strain -> (principal values of dev ln V, ln J)."""
     X = memory[[0, 1, 2, 1, 3, 4, 2, 4, 5]].T.reshape(-1, 3, 3)
-    # on the CPU: cusolver refuses batches of a hundred thousand small matrices
-    x = torch.linalg.eigvalsh(X.cpu())
+    x = torch.stack(spectral.principal_values(X), 1)
     # below the floor of the stress along the tangent, as there: finite where round-off makes b < 0
     floor = spectral._FLOOR
     log_stretch = torch.where(1 + x > floor, torch.log1p(x.clamp(min=floor - 1)), math.log(floor) + (1 + x) / floor - 1)
-    log_stretch = log_stretch.to(X.device) / 2
+    log_stretch = log_stretch / 2
     return log_stretch - log_stretch.mean(1, keepdim=True), log_stretch.sum(1)
 
 

@@ -112,11 +112,8 @@ class Viscoelastic(base.AbstractMaterial):
         psi = torch.zeros_like(H[:, 0, 0])
         if self.elastic:
             mu, lam = coefficients[:2]
-            F = one + H
-            U, s, Vt = torch.linalg.svd(F)
-            sign = torch.linalg.det(U @ Vt)
-            s = torch.cat([s[:, :2], s[:, 2:] * sign[:, None]], dim=1)
-            psi = psi + mu * ((s - 1) ** 2).sum(1) + lam / 2 * (torch.linalg.det(F) - 1) ** 2
+            J = spectral.determinant(one + H)
+            psi = psi + mu * spectral.stretch_distance(H) + lam / 2 * (J - 1) ** 2
         for i in range(self.branches):
             mu, K = coefficients[self._first(i) : self._first(i) + 2]
             strain = memory[6 * i : 6 * i + 6]
