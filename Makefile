@@ -32,7 +32,7 @@ $(ready): pyproject.toml constraints.txt
 	@echo 'setting up .venv (5 to 10 minutes, once): build tools, torch, the rest'
 	@$(pip) pip setuptools wheel
 	@$(pip) torch torchvision
-	@$(pip) --no-build-isolation -e '.[dev]'
+	@$(pip) --no-build-isolation -e '.[dev,sfm]'
 	@touch $@
 
 run: $(ready) ## the pipeline on SCENE; what has been computed before is reused

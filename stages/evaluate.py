@@ -121,7 +121,10 @@ def same(simulated: tuple[AbstractBoundary, ...], filmed: tuple[AbstractBoundary
     if [type(b) for b in simulated] != [type(b) for b in filmed]:
         return False
     pairs = [(getattr(a, f.name), getattr(b, f.name)) for a, b in zip(simulated, filmed) for f in fields(a)]
-    return all(a == b if isinstance(a, str) else np.allclose(a, b, rtol=1e-3) for a, b in pairs)
+    words = (str, type(None))
+    return all(
+        a == b if isinstance(a, words) or isinstance(b, words) else np.allclose(a, b, rtol=1e-3) for a, b in pairs
+    )
 
 
 def matched(name: str, video: Video, take: Take, cameras: tuple[int, ...]) -> list[Tensor]:

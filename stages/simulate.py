@@ -61,12 +61,14 @@ class Simulate:
 def excited(
     excitation: tuple[AbstractBoundary, ...], force: Mapping[str, float] | None
 ) -> tuple[AbstractBoundary, ...]:
-    """The excitation with every impulse given `force` [N], and without impulses of no force."""
+    """The excitation with `force` [N] in place of that of every impulse, and without impulses of no force."""
     if force is None:
         return tuple(excitation)
     vector = (float(force["x"]), float(force["y"]), float(force["z"]))
-    pushed = tuple(replace(b, force=vector) if isinstance(b, Impulse) else b for b in excitation)
-    return tuple(b for b in pushed if any(vector) or not isinstance(b, Impulse))
+    pushed = tuple(
+        replace(b, force=vector) if isinstance(b, Impulse) and b.force is not None else b for b in excitation
+    )
+    return tuple(b for b in pushed if any(vector) or not isinstance(b, Impulse) or b.force is None)
 
 
 def _on_cpu(trajectory: Trajectory) -> Trajectory:

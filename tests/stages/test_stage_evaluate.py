@@ -13,7 +13,7 @@ from physics3d.mpm.boundaries.impulse import Impulse
 from physics3d.mpm.world import Estimate
 from physics3d.scenes.base import Capture, Take
 from physics3d.video import Video
-from stages.evaluate import FROZEN, REFERENCE, Evaluate
+from stages.evaluate import FROZEN, REFERENCE, Evaluate, same
 
 FPS, H, W = 30.0, 60, 80
 
@@ -124,3 +124,12 @@ def test_what_cannot_be_compared_is_refused():
             Evaluate()(reference, {"learned": made}, {}, log=Log(None))
     with pytest.raises(ValueError, match="nothing to evaluate"):
         Evaluate()(replace(reference, takes=()), {"learned": video(good)}, {}, log=Log(None))
+
+
+def test_pokes_are_compared_whatever_region_they_take():
+    ball = Impulse(force=(0.1, 0.0, 0.0), centre=(0.0, 0.0, 0.1), radius=0.02, duration=0.1)
+    box = Impulse(force=(0.1, 0.0, 0.0), lower=(0.0, 0.0, 0.0), upper=(0.1, 0.1, 0.1), duration=0.1)
+    each = Impulse(acceleration_of_each=(0.1, 0.0, 0.0), centre=(0.0, 0.0, 0.1), nearest=5, duration=0.1)
+    for i, one in enumerate((ball, box, each)):
+        for j, other in enumerate((ball, box, each)):
+            assert same((one,), (other,)) == (i == j)
