@@ -43,7 +43,7 @@ LEAST_FRACTION = 0.25  # a cell filled less than this is no particle of its own
 SUBDIVISION = 4  # samples along each side of a boundary cell
 ISOLATED = ("attach", "drop", "keep")  # what may become of a piece
 JOINT = 4.0  # widest gap that is bridged [spacings]: two cells of the simulation grid
-CONTACT = 0.75  # a particle nearer to a static Gaussian is held by it [spacings]; more would hold what is free above it
+CONTACT = (0.6, 1.0)  # particles nearer to a static Gaussian are held by it; at most, where none is so near [spacings]
 SPECK = 0.05  # static clusters of less than this share are mistakes of the segmentation and hold nothing
 
 
@@ -551,19 +551,28 @@ def bridged(piece: np.ndarray, rest: np.ndarray, spacing: float) -> tuple[np.nda
 
 
 def touching(position: np.ndarray, spacing: float, static: Gaussians, log: Log) -> np.ndarray:
-    """Bool [p]: particles within CONTACT spacings of a static Gaussian that is part of more than a speck."""
+    """Bool [p]: particles within CONTACT spacings of static Gaussians that are part of more than a speck.
+
+    A flat contact also holds what lies within its outline: of a stem in its soil only the rim touches what is seen.
+    """
     attached = np.zeros(len(position), bool)
     if len(static):
-        reach = CONTACT * spacing
+        least, reach = (c * spacing for c in CONTACT)
         solid = static.select(torch.from_numpy(not_specks(static.mean.double().numpy(), 4 * spacing)))
         point, _ = spread(solid, spacing / 2)
         near = ((point > position.min(0) - reach) & (point < position.max(0) + reach)).all(1)
         if near.any():
-            attached = cKDTree(point[near]).query(position, distance_upper_bound=reach)[0] < reach
-    log.metric("attached", int(attached.sum()))
+            distance, _ = cKDTree(point[near]).query(position)
+            attached = distance < min(max(least, 1.3 * distance.min()), reach)
     if not attached.any():
+        log.metric("attached", 0)
         log.info("nothing static touches the body: it is held nowhere, unless the scene names a fixed region")
         return attached
+    where = position[attached]
+    patch = clusters(where, 3 * spacing)
+    for k in range(int(patch.max()) + 1):
+        attached |= within_outline(position, where[patch == k], spacing)
+    log.metric("attached", int(attached.sum()))
     where = position[attached]
     patch = clusters(where, 3 * spacing)
     for k in range(min(int(patch.max()) + 1, 8)):
@@ -572,6 +581,18 @@ def touching(position: np.ndarray, spacing: float, static: Gaussians, log: Log) 
     if patch.max() >= 8:
         log.info(f"and at {int(patch.max()) - 7} smaller places")
     return attached
+
+
+def within_outline(position: np.ndarray, patch: np.ndarray, spacing: float) -> np.ndarray:
+    """Bool [p]: inside the convex outline of a flat patch [k, 3], in its own layer; of no use where it is not flat."""
+    centre = patch.mean(0)
+    _, size, axes = np.linalg.svd(patch - centre, full_matrices=False)
+    if len(patch) < 4 or size[2] > spacing * np.sqrt(len(patch)) or size[1] < 1e-3 * size[0]:
+        return np.zeros(len(position), bool)
+    local, all_of_them = (patch - centre) @ axes.T, (position - centre) @ axes.T
+    inside = Delaunay(local[:, :2]).find_simplex(all_of_them[:, :2]) >= 0
+    low, high = local[:, 2].min() - spacing / 4, local[:, 2].max() + spacing / 4
+    return inside & (all_of_them[:, 2] >= low) & (all_of_them[:, 2] <= high)
 
 
 def not_specks(point: np.ndarray, cell: float) -> np.ndarray:

@@ -7,8 +7,13 @@ import pytest
 import torch
 from analytic_bodies import annulus, box, cup, discs, joined, sheet, sphere, together, torus, wall
 
-from physics3d.filling import Poisson, WindingNumber, fill, sample_surface
+from physics3d.filling import Poisson, WindingNumber, clusters, fill, sample_surface
 from physics3d.log import Log
+from physics3d.mpm.boundaries.fixed_region import FixedRegion
+from physics3d.mpm.boundaries.impulse import Impulse
+from physics3d.mpm.materials.neo_hookean import NeoHookean
+from physics3d.mpm.rollout import rollout
+from physics3d.mpm.world import World
 
 SPACING = 0.006
 norm = np.linalg.norm
@@ -180,6 +185,102 @@ def test_small_pieces_are_dropped_when_asked(rng):
     assert len(dropped.embedding.which) == len(gaussians)
 
 
+def two_pieces(rng, gap: float):
+    """Balls of 5 and 2 cm radius, `gap` apart along x."""
+    small = discs(*sphere(2500, 0.02, rng), rng)
+    small = replace(small, mean=small.mean + torch.tensor([0.07 + gap, 0, 0]))
+    return joined(discs(*sphere(8000, 0.05, rng), rng), small)
+
+
+def pieces(body) -> int:
+    return int(clusters(body.position.double().numpy(), 2 * SPACING).max()) + 1
+
+
+@pytest.mark.parametrize(("isolated", "gap", "count"), [
+    ("attach", 3, 1), ("attach", 6, 2), ("keep", 3, 2), ("drop", 3, 1),
+])  # fmt: skip
+def test_isolated_pieces_are_named_and_treated_as_asked(isolated, gap, count, rng, tmp_path):
+    """A gap of 3 spacings is bridged, one of 6 is not; wherever the piece goes, its Gaussians ride along."""
+    gaussians = two_pieces(rng, gap * SPACING)
+    body = filled(gaussians, isolated=isolated, log=Log(tmp_path, quiet=True))
+    assert pieces(body) == count
+    assert len(body.embedding.which) == len(gaussians)
+    reaches = float(body.position[:, 0].max()) > 0.06
+    assert reaches == (isolated != "drop")
+    said = (tmp_path / "log.txt").read_text()
+    fate = {"attach": "attached across" if gap == 3 else "kept", "keep": "kept", "drop": "dropped"}[isolated]
+    assert "isolated piece at (0.1" in said or "isolated piece at (0.0" in said
+    assert "% of the volume, " + fate in said
+    if isolated == "attach" and gap == 3:
+        whole = filled(gaussians, isolated="keep")
+        # the bridge is thin: 31 particles of 3000
+        assert 1 < float(body.volume.sum() / whole.volume.sum()) < 1.02
+
+
+def test_pieces_of_different_parts_are_not_joined(rng):
+    gaussians = two_pieces(rng, 3 * SPACING)
+    label = torch.ones(len(gaussians), dtype=torch.int32)
+    label[8000:] = 2
+    assert pieces(filled(gaussians, isolated="attach", label=label)) == 2
+
+
+def test_gaussians_ride_on_their_own_side_of_a_gap(rng):
+    gaussians = two_pieces(rng, 2.5 * SPACING)
+    body = filled(gaussians)
+    side = (body.position[:, 0] > 0.055)[body.embedding.neighbours]
+    carried = torch.where(body.embedding.weights != 0, side, side[:, :1])
+    assert bool((carried == (torch.arange(len(gaussians)) >= 8000)[:, None]).all())
+
+
+def stem_on_a_plate(rng, *, speck=False):
+    """A stem, 3 cm thick and 14 cm tall, on a static plate: Gaussians, labels. `speck`: some of its top is static."""
+    side, top = wall(7000, 0.015, 0, 0.14, rng), annulus(800, 0, 0.015, 0.14, rng)
+    stem = discs(*together(side, top), rng)
+    plate = discs(*annulus(6000, 0.013, 0.12, 0, rng), rng, sigma=0.003)  # seen up to a little under the rim
+    label = torch.cat([torch.ones(len(stem)), torch.zeros(len(plate))]).int()
+    if speck:
+        label[:200] = torch.where(stem.mean[:200, 2] > 0.1, 0, 1).int()
+    return joined(stem, plate), label
+
+
+@pytest.mark.parametrize("speck", [False, True])
+def test_a_body_is_held_where_it_touches_what_is_static(speck, rng):
+    """... and by nothing else: not by a few Gaussians of its own that the segmentation took for static."""
+    gaussians, label = stem_on_a_plate(rng, speck=speck)
+    body = filled(gaussians, label=label, attach=True)
+    at = body.position[body.attached]
+    assert len(at) >= 8
+    assert float(at[:, 2].max()) < SPACING
+    assert filled(gaussians, label=label).attached is None
+    alone = filled(gaussians.select(label > 0), attach=True)
+    assert not bool(alone.attached.any()) and alone.held(()) == ()
+
+
+def test_held_particles_do_what_a_box_written_by_hand_does(rng):
+    gaussians, label = stem_on_a_plate(rng)
+    body = filled(gaussians, label=label, attach=True)
+    (found,) = body.held(())
+    box = FixedRegion(lower=(-1, -1, -1), upper=(1, 1, 0.001))
+    assert body.held((box,)) == ()
+    world = World(
+        material=NeoHookean(),
+        density=300.0,
+        start={"youngs_modulus": 1e5, "poissons_ratio": 0.3},
+        dx=2 * SPACING,
+        gravity=(0.0, 0.0, 0.0),
+    )
+    poke = Impulse(force=(0.06, 0.03, 0), centre=(0, 0, 0.13), radius=0.03, duration=0.1)
+    moved = []
+    for holding in ((found,), (box,), ()):
+        more = dict(excitation=(*holding, poke), frames=6, frame_dt=0.04, threads=1, log=Log(None))
+        run = rollout(world, world.estimate().parameters, body.position, body.volume, **more)
+        moved.append(run.position - body.position)
+    by_hand = moved[1].norm()
+    # the found ones reach up to three quarters of a spacing above the plate, of a stem of 23 spacings
+    assert float((moved[0] - moved[1]).norm() / by_hand) < 0.15
+    assert float((moved[2] - moved[1]).norm() / by_hand) > 1
+
+
 def test_floaters_become_no_particles(rng):
     gaussians = discs(*sphere(8000, 0.05, rng), rng)
     far = discs(rng.uniform(-0.2, 0.2, (12, 3)) + np.array([0, 0, 0.4]), np.tile([0.0, 0.0, 1.0], (12, 1)), rng)
@@ -198,3 +299,5 @@ def test_nonsense_is_refused_with_a_remedy(rng):
         filled(gaussians, spacing=1e-5)
     with pytest.raises(ValueError, match=r"fill.opacity = 0.99; lower"):
         filled(gaussians, opacity=0.99)
+    with pytest.raises(ValueError, match=r"fill.isolated is 'burn'; take one of attach"):
+        filled(gaussians, isolated="burn")

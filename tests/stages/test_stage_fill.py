@@ -44,3 +44,8 @@ def test_labels_of_another_reconstruction_are_refused(two_balls):
     other = Segmentation(label=torch.ones(5).int(), parts=("ball",), masks=None, mask_views=())
     with pytest.raises(ValueError, match="5 labels for 6000 Gaussians"):
         Fill(spacing=0.008)(two_balls, other, log=Log(None))
+
+
+def test_attach_is_auto_or_none(two_balls):
+    with pytest.raises(ValueError, match=r"fill.attach is 'glue'; take auto or none"):
+        Fill(spacing=0.008, attach="glue")(two_balls, None, log=Log(None))

@@ -1,8 +1,8 @@
 """Held particles: the body does not move where these particles are at rest (a flower where it touches its pot).
 
 What `FixedRegion` is for a box, this is for any set of places, found rather than written down by hand. A grid node has
-no velocity if it is the nearest one of a held particle, or gets two fifths of its mass from held ones at rest (half,
-but for the far end of the weights); of the particles in a box these are the nodes of the box.
+no velocity if it is the nearest one of a held particle, or gets three tenths of its mass from held ones at rest (a
+layer of them half a cell thick gives that); of the particles in a box these are the nodes of the box.
 
 The nodes are a table over the box around them, in `parameters`:
     corner (3) [m], 1/dx [1/m], nodes along each axis (3), then 1 or 0 for each node.
@@ -20,7 +20,7 @@ from torch import Tensor
 from physics3d.mpm.boundaries import base
 from physics3d.mpm.transfer import vector
 
-SHARE = 0.4  # of a node's mass
+SHARE = 0.3  # of a node's mass
 
 
 @dataclass(frozen=True, kw_only=True)
