@@ -5,6 +5,7 @@ import functools
 import numpy as np
 import pytest
 import scipy.linalg
+import torch
 import warp as wp
 
 from physics3d.mpm import spectral
