@@ -208,7 +208,7 @@ def render_deformed(
     moving = torch.zeros(len(drawn[0]), dtype=torch.bool, device=mean.device)
     moving[embedding.which.to(mean.device)] = True
     moving[len(gaussians) :] = True
-    tiles = tiles_of(*(a[moving] for a in drawn[:3]), camera)
+    tiles = tiles_of(drawn[0][moving], drawn[1][moving], drawn[2][moving], camera)
     part, place = rasterize(*drawn, camera, background=background, tiles=tiles), window(tiles)
     whole = {name: getattr(backdrop.still, name).clone() for name in ("color", "alpha", "depth")}
     for name, picture in whole.items():
