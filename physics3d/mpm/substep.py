@@ -241,6 +241,7 @@ def _advance(real, material: wp.Function) -> wp.Kernel:
     return advance_kernel
 
 
+_KEEP_MOMENTA = 4  # nodes per particle up to which the momenta of nodes are kept for the way back
 _KEEP = 5  # place of `keep`, then `onward`, among the arguments of the particle pass
 _MULTIPLY_ADD = "-ffp-contract=fast"  # one rounding for a b + c where the processor can, on the CPU as on CUDA
 
@@ -333,6 +334,8 @@ class Substeps:
         self.lost = [self._zeros(1, wp.int32) for _ in self.ranges]
         self.states: list[State] = []
         self.adjoint: dict | None = None
+        self.kept_momenta: wp.array | None = None
+        self.kept_path: tuple[int, ...] = ()  # of the run whose momenta they are
         self.capacity = 0
         self.set_window((0, 0, 0), (1, 1, 1))
 
@@ -346,6 +349,7 @@ class Substeps:
         """Lay the grid over nodes lowest .. lowest + size - 1."""
         self.window.assign(np.array([*lowest, *size], np.int32))
         self.node_count = int(np.prod(size))
+        self.kept_path = ()
         if self.node_count > self.capacity:
             self.capacity = int(1.5 * self.node_count) + 1  # one more: see `columns`
             self.grid = self._zeros((self.workers, self.capacity), vector4(self.real))
@@ -357,7 +361,8 @@ class Substeps:
     def run(self, clock: np.ndarray, path: Sequence[int]) -> int:
         """Substep s takes state path[s] to state path[s + 1] by row s of the clock; the count of lost particles.
 
-        A path may stay at one state: in place. Velocities and stress on the way are then not kept."""
+        A path may stay at one state: in place. Velocities and stress on the way are then not kept. A path that never
+        comes back to a state leaves what `reverse` needs."""
         self._set_clock(clock)
         for lost in self.lost:
             lost.zero_()
@@ -376,6 +381,10 @@ class Substeps:
                     if name in launch:
                         launch[name].launch()
 
+        momenta = self._momenta()
+        keep = momenta is not None and len(set(path)) == len(path)
+        self.kept_path = tuple(path) if keep else ()
+
         def fast(w: int, wait: Callable[[], object]) -> None:
             last = len(work) - 1
             self._set_row(w, 0)
@@ -383,7 +392,7 @@ class Substeps:
             for s, launch in enumerate(launches[w]):
                 self._set_row(w, s)
                 wait()
-                self._update_phase(launch, *dims[w], wait)
+                self._update_phase(launch, *dims[w], wait, momenta[s] if keep else None)
                 wait()
                 if s < last:
                     self._span(launch["clear"], 0, self.node_count)
@@ -442,7 +451,7 @@ class Substeps:
         backward = [
             [self._backward(w, i, j, side) for (_, (i, j)), side in zip(steps, sides)] for w in range(self.workers)
         ]
-        dims = self._dims()
+        dims, momenta = self._dims(), self._momenta() if self.kept_path == tuple(path) else None
 
         def worker(w: int, wait: Callable[[], object]) -> None:
             for (s, _), launch, adjoint, now in zip(steps, forward[w], backward[w], sides):
@@ -451,10 +460,16 @@ class Substeps:
                     adjoint_states[1 - now].flat.zero_()
                 if "clear_pushed" in adjoint:
                     adjoint["clear_pushed"].launch()
-                self._scatter_phase(launch)
+                if momenta is None:
+                    self._scatter_phase(launch)
+                elif "push" in launch:
+                    launch["push"].launch()
                 self._span(adjoint["clear_private"], 0, self.node_count)
                 wait()
-                self._update_phase(launch, *dims[w], wait)
+                if momenta is None:
+                    self._update_phase(launch, *dims[w], wait)
+                else:
+                    self._update_again(launch, *dims[w], wait, momenta[s])
                 wait()
                 for name in ("advance", "steer", "gather"):
                     if name in adjoint:
@@ -623,11 +638,30 @@ class Substeps:
         self._span(launch["clear"], 0, self.node_count)
         launch["scatter"].launch()
 
-    def _update_phase(self, launch: dict[str, wp.Launch], first: int, count: int, wait: Callable[[], object]) -> None:
+    def _update_phase(
+        self,
+        launch: dict[str, wp.Launch],
+        first: int,
+        count: int,
+        wait: Callable[[], object],
+        momenta: np.ndarray | None = None,  # [node, 4] gets what the nodes hold before the update
+    ) -> None:
         if count and self.workers > 1:
             self._span(launch["total"], first, count)
+        if momenta is not None:
+            momenta[first : first + count] = self._total_momenta[first : first + count]
         if self.mirrored:
             wait()  # nodes read those of other workers
+        if count:
+            self._span(launch["update"], first, count)
+
+    def _update_again(
+        self, launch: dict[str, wp.Launch], first: int, count: int, wait: Callable[[], object], momenta: np.ndarray
+    ) -> None:
+        """As `_update_phase` left the nodes, from the momenta that it kept."""
+        self._total_momenta[first : first + count] = momenta[first : first + count]
+        if self.mirrored:
+            wait()
         if count:
             self._span(launch["update"], first, count)
 
@@ -674,10 +708,22 @@ class Substeps:
         return wp.zeros(shape, dtype=dtype, device=str(self.device))
 
     def _make_adjoint_grid(self) -> None:
+        self.kept_momenta = None
         self.adjoint_grid = self._zeros(self.capacity, vector4(self.real))
         self.adjoint_node_velocity = self._zeros((self.workers, self.capacity), vector(self.real))
         if self.fast:
+            if self.capacity < _KEEP_MOMENTA * self.n:
+                shape = (len(self.clock), self.capacity)
+                self.kept_momenta = self._zeros(shape, vector4(self.real))
             self.adjoint_fours = self._zeros((self.workers, self.capacity), vector4(self.real))
+
+    def _momenta(self) -> np.ndarray | None:
+        """[substep of a run, node, 4] kept for `reverse`, once there is an adjoint and unless nodes are far more than
+        particles; then `reverse` scatters again."""
+        if self.adjoint is None or self.kept_momenta is None:
+            return None
+        self._total_momenta = self.grid.numpy()[0]
+        return self.kept_momenta.numpy()
 
     def _drop_launches(self) -> None:
         self.launches: dict[tuple, dict[str, wp.Launch]] = {}
