@@ -290,7 +290,8 @@ def write(rows: list[dict], device: str, seed: int) -> None:
                 axis.plot(sizes, values, style, marker="o", color=f"C{i}", label=f"{name}, {what}")
     axis.set(xscale="log", yscale="log", xlabel="particles", ylabel=PER_SUBSTEP, title=title)
     axis.title.set_size(8)
-    axis.legend(fontsize=7)
+    if axis.lines:
+        axis.legend(fontsize=7)
     axis.grid(alpha=0.3, which="both")
     figure.savefig(RESULTS / f"speed_{kind}.png", dpi=110)
 
