@@ -4,9 +4,10 @@ import pytest
 import torch
 from small_scene import DAMPED, bar, cameras, capture, learner
 
-from physics3d.gaussians import twin
 from physics3d.gaussians.deform import carry
 from physics3d.gaussians.sh import sh_color
+from physics3d.gaussians.splatting import Numerics
+from physics3d.gaussians.twin import rasterize_plainly
 from physics3d.learning.fields import GlobalField
 from physics3d.learning.fit import Chain, draw_frames, fit, linearise, polish, search, sensitivity
 from physics3d.log import Log
@@ -82,7 +83,7 @@ def test_gradient_through_prior_and_simulator_is_exact(poked):
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5 * float(expected.abs().max()))
 
 
-def test_gradient_of_the_whole_chain_is_that_of_central_differences(poked, monkeypatch):
+def test_gradient_of_the_whole_chain_is_that_of_central_differences(poked):
     """Backward through prior, Warp renderer and simulator; differences with the plain float64 renderer.
 
     The renderer ends a splat where its alpha falls below 1/255. Differences see that edge move (5 to 15 % in so small a
@@ -91,7 +92,7 @@ def test_gradient_of_the_whole_chain_is_that_of_central_differences(poked, monke
     field, chain = poked
     gaussians, body = bar()
     camera, X = cameras()[0], body.position
-    monkeypatch.setattr(twin, "ALPHA_MIN", 1e-9)
+    whole = Numerics(cutoff=1e-9)
 
     def plainly(motion, view, frames):
         pictures = []
@@ -100,7 +101,8 @@ def test_gradient_of_the_whole_chain_is_that_of_central_differences(poked, monke
             color = sh_color(gaussians.sh.double(), mean - camera.centre)
             white = torch.ones(3, dtype=torch.float64)
             opacity = gaussians.opacity.double()
-            pictures.append(twin.rasterize_plainly(mean, covariance, opacity, color, camera, background=white).color)
+            arguments = (mean, covariance, opacity, color, camera)
+            pictures.append(rasterize_plainly(*arguments, background=white, numerics=whole).color)
         return torch.stack(pictures)
 
     plain = Chain(simulate=chain.simulate, render=plainly, clips={0: chain.clips[0].double()}, prior=chain.prior)
