@@ -512,11 +512,12 @@ class _Solver:
         mass, v = self.mass.double(), now.v.double()
         x = self.rest.double() + now.u.double()
         momentum = (mass[:, None] * v).sum(0)
-        # about the origin, with the spin inside the particles: an APIC particle is a cloud of m dx^2/4 along each axis
+        # about the origin, with the spin inside the particles: an APIC particle is a cloud of m dx^2/4 along each axis;
+        # its motion inside is kinetic energy too, without which a body that is torn or crushed seems to gain some
         L = now.L.double()
         spin = torch.stack([L[:, 2, 1] - L[:, 1, 2], L[:, 0, 2] - L[:, 2, 0], L[:, 1, 0] - L[:, 0, 1]], 1)
         angular = (mass[:, None] * (torch.linalg.cross(x, v) + self.world.dx**2 / 4 * spin)).sum(0)
-        kinetic = 0.5 * float((mass * v.square().sum(1)).sum())
+        kinetic = 0.5 * float((mass * (v.square().sum(1) + self.world.dx**2 / 4 * L.square().sum((1, 2)))).sum())
         psi = self.world.material.energy(self.coefficients, now.H, now.memory).double()
         elastic = float((psi * self.volume.double()).sum())
         potential = -float((mass * (x @ x.new_tensor(self.world.gravity))).sum())

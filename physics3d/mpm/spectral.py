@@ -820,12 +820,14 @@ def stretch_distance(H: Float[Tensor, "n 3 3"]) -> Float[Tensor, " n"]:
     second = (tr.square() - E.square().sum((1, 2))) / 2
     h = H.diagonal(dim1=1, dim2=2).sum(1)
     j = h + (h.square() - (H * H.mT).sum((1, 2))) / 2 + determinant(H)  # J - 1
-    e = tr / ((1 + tr / 3).clamp(min=0).sqrt() + 1)  # of equal stretches: the upper bound
+    mean = (1 + tr / 3).clamp(min=0).sqrt()
+    e = upper = tr / (mean + 1)  # of equal stretches
     for _ in range(60):
         g = (6 * e + e.square() - tr) / 2  # sum of products of two stretches, minus 3
         slope = (6 + 2 * g) * (3 + e) - 2 * (1 + j)
         step = (6 * g + g.square() - 2 * tr - second - 2 * (e + 3 * j + j * e)) / slope.clamp(min=1e-30)
-        e = e - step
+        # of a body crushed to nothing, rounding takes the slope: 3 + e is at least the mean stretch
+        e = torch.minimum(torch.maximum(e - step, mean - 3), upper)
         if not bool((step.abs() > torch.finfo(H.dtype).eps * (e.abs() + tr.abs())).any()):
             break
     return tr - 2 * e

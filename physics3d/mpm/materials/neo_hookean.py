@@ -8,6 +8,7 @@ Bonet and Wood (2008), sec. 6.4.3.
 """
 
 import functools
+import math
 from dataclasses import dataclass
 
 import torch
@@ -17,6 +18,8 @@ from torch import Tensor
 
 from physics3d.mpm import spectral
 from physics3d.mpm.materials import base
+
+_FLOOR = 1e-4  # J
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,8 +51,13 @@ class NeoHookean(base.AbstractMaterial):
     ) -> Float[Tensor, " n"]:
         mu, lam = coefficients
         F = H + torch.eye(3, dtype=H.dtype, device=H.device)
-        log_J = torch.log(torch.linalg.det(F))
-        return mu / 2 * ((F * F).sum((1, 2)) - 3) - mu * log_J + lam / 2 * log_J**2
+        # finite where round-off makes J <= 0, for which there is no energy
+        J = torch.linalg.det(F).clamp(min=1e-30)
+        log_J, floor = torch.log(J), math.log(_FLOOR)
+        # below the floor the integral of the tangent, so that the derivative is the stress there too
+        below = floor**2 / 2 + (floor - 1) * (log_J - floor) + J / _FLOOR - 1
+        volumetric = torch.where(J > _FLOOR, log_J**2 / 2, below)
+        return mu / 2 * ((F * F).sum((1, 2)) - 3) - mu * log_J + lam * volumetric
 
     def advance(self, real: type) -> wp.Function:
         return _advance(real)
@@ -59,7 +67,7 @@ class NeoHookean(base.AbstractMaterial):
 def _advance(real: type) -> wp.Function:
     mat33 = spectral.matrix_type(real)
     volume_change = spectral.volume_change(real)
-    log1p_extended = spectral.log1p_extended(real, floor=1e-4)
+    log1p_extended = spectral.log1p_extended(real, _FLOOR)
 
     @wp.func(name=f"neo_hookean_{real.__name__}")
     def advance(
