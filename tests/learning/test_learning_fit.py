@@ -108,7 +108,8 @@ def test_gradient_of_the_whole_chain_is_that_of_central_differences(poked):
     plain = Chain(simulate=chain.simulate, render=plainly, clips={0: chain.clips[0].double()}, prior=chain.prior)
     components = (0, 4)  # stiffness and a velocity
     found = gradient(chain, field)[list(components)]
-    torch.testing.assert_close(found, differences(plain, field, components, 1e-3), rtol=0.05, atol=0.0)
+    # so short a step that no frame takes another number of substeps
+    torch.testing.assert_close(found, differences(plain, field, components, 1e-5), rtol=0.05, atol=0.0)
 
 
 def test_descent_finds_the_truth_from_random_frames_and_views_and_leaves_the_unseen_alone():
