@@ -234,7 +234,7 @@ def wave_speed(cells: int, **changes) -> Answer:
 
 
 def column(cells: int, **changes) -> Answer:
-    """A column at rest under its own weight: sigma(Z) = -rho g (L - Z) beyond the first cell."""
+    """A column at rest under its own weight: sigma(Z) = -rho g (L - Z), but for the first cell."""
     dx, g, M = 1.0 / cells, 9.81, 1e6 * 0.7 / (1.3 * 0.4)
     position, volume = block((1, 1, cells), dx)
     walls = BoundingBox(kind="slip", lower=(0.0, 0.0, 0.0), upper=(dx, dx, 3.0))
