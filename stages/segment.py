@@ -10,7 +10,7 @@ from physics3d.gaussians.render import render
 from physics3d.log import Log
 from physics3d.scenes.base import Capture
 from physics3d.segmentation import Segmentation
-from physics3d.segmentation.lift import contributions, islands, lift, shares, touching
+from physics3d.segmentation.lift import contributions, islands, lift, one_hot, shares, touching
 from physics3d.segmentation.masks import AbstractMasker, GrabCut
 from physics3d.segmentation.previews import contact_sheet, tinted
 from physics3d.segmentation.prompts import (
@@ -19,8 +19,9 @@ from physics3d.segmentation.prompts import (
     View,
     carry_masks,
     mask_of_box,
+    numbered,
     prompted_mask,
-    refined_mask,
+    refined_masks,
     told_apart,
     within_any,
 )
@@ -123,14 +124,24 @@ class Segment:
     ) -> tuple[list[View], list[torch.Tensor]]:
         """The views that could be masked, and for each a map of labels [h, w]."""
         masks: dict[str, dict[int, np.ndarray]] = {}
+        for first in {view.index: view for view, _ in said.values()}.values():
+            here = {part: mask for part, (view, mask) in said.items() if view.index == first.index}
+            carried = carry_masks(
+                gaussians,
+                first,
+                here,
+                {p: rooms[p] for p in here},
+                views,
+                self.masker,
+                log=log,  # type: ignore[arg-type]
+            )
+            masks |= {part: {i: found[part] for i, found in carried.items()} for part in here}
         for part in parts:
             own = tuple(p for p in self.prompts if p.part == part)
-            if part in said:
-                masks[part] = carry_masks(gaussians, *said[part], rooms[part], views, self.masker, log=log)  # type: ignore[arg-type, call-arg, misc]
-            elif own:
+            if part not in said and own:
                 found = {v.index: mask_of_box(own[0], v, self.masker) for v in log.progress(views, "masking the box")}
                 masks[part] = {i: m for i, m in found.items() if m is not None}
-            else:
+            elif part not in said:
                 masks[part] = {v.index: np.ones(v.image.shape[:2], bool) for v in views}
             if sum(m.sum() for m in masks[part].values()) < LEAST_PIXELS:
                 names = ", ".join(v.name for v in views[:4])
@@ -163,12 +174,8 @@ class Segment:
         """Maps again, each view now masked by what all views together say."""
         maps = []
         for view in log.progress(views, "refining masks"):
-            drawn = shares(gaussians, label, len(parts), view.camera)
-            masks = []
-            for part, share in zip(parts, drawn):
-                mask = refined_mask(share, view, rooms.get(part), self.masker)
-                # where two parts meet, both outlines are guesses: a pixel is of the one that shows there
-                masks.append(mask & (share >= drawn.max(0) - 1e-6) if len(parts) > 1 else mask)
+            drawn = shares(gaussians, one_hot(label, len(parts)), view.camera)
+            masks = refined_masks(drawn, view, [rooms.get(part) for part in parts], self.masker)
             maps.append(_labelled(masks, view, capture))
         return maps
 
@@ -252,12 +259,10 @@ def _index(capture: Capture, view: str | int) -> int:
 
 
 def _labelled(masks: list[np.ndarray], view: View, capture: Capture) -> torch.Tensor:
-    """Map of labels [h, w]; a pixel claimed twice belongs to the part named first, one outside the matte to none."""
+    """Map of labels [h, w]; a pixel outside the matte belongs to none."""
     import cv2
 
-    labelled = np.zeros(view.image.shape[:2], np.int64)
-    for k in range(len(masks), 0, -1):
-        labelled[masks[k - 1]] = k
+    labelled = numbered(masks)
     if capture.alphas:
         size = view.camera.width, view.camera.height
         labelled[cv2.resize(capture.alphas[view.index].numpy(), size, interpolation=cv2.INTER_AREA) < 128] = 0

@@ -50,17 +50,38 @@ def lift(mean: Float[Tensor, "n 3"], weights: Float[Tensor, "n count"]) -> Int[T
     return label.to(torch.int32)
 
 
-def shares(
-    gaussians: Gaussians, label: Int[Tensor, " n"], count: int, camera: Camera
-) -> Float[np.ndarray, "count h w"]:
-    """Share of each pixel (0..1) that the Gaussians of each label 1..count contribute."""
+def shares(gaussians: Gaussians, belief: Float[Tensor, "n k"], camera: Camera) -> Float[np.ndarray, "k h w"]:
+    """Share of each pixel (0..1) that belongs to each of k parts, when `belief` of each Gaussian does."""
     covariance, drawn = gaussians.covariance(), []
-    one_hot = torch.nn.functional.one_hot(label.long(), 1 + -(-count // 3) * 3)[:, 1:].to(gaussians.mean)
-    for three in one_hot.split(3, 1):
+    for three in torch.nn.functional.pad(belief, (0, -belief.shape[1] % 3)).to(gaussians.mean).split(3, 1):
         with torch.no_grad():
             picture = rasterize(gaussians.mean, covariance, gaussians.opacity, three, camera, background=(0, 0, 0))
         drawn.append(picture.color.permute(2, 0, 1).cpu())
-    return torch.cat(drawn)[:count].numpy()
+    return torch.cat(drawn)[: belief.shape[1]].numpy()
+
+
+def one_hot(label: Int[Tensor, " n"], count: int) -> Float[Tensor, "n count"]:
+    """1 where the label is 1..count."""
+    return torch.nn.functional.one_hot(label.long(), 1 + count)[:, 1:].float()
+
+
+def expected(
+    mean: Float[Tensor, "n 3"], weights: Float[Tensor, "n count"], rooms: Bool[Tensor, "k n"]
+) -> tuple[Float[Tensor, "n k"], Float[Tensor, "n k"]]:
+    """(what the views so far say of the parts 1..k, what may be added): the second of Gaussians that none has shown.
+
+    Those may be of the part nearest to them whose room holds them. A label is kept only in the part's room.
+    """
+    shown = weights.sum(1) > NEGLIGIBLE
+    said = one_hot(lift(mean, weights), len(rooms)) * rooms.T * shown[:, None]
+    position, nearest = mean.double().numpy(), torch.full(rooms.T.shape, torch.inf, dtype=torch.float64)
+    for k, room in enumerate(rooms):
+        of_part, open_ = said[:, k] > 0, room & ~shown
+        if of_part.any() and open_.any():
+            distance, _ = cKDTree(position[of_part.numpy()]).query(position[open_.numpy()])
+            nearest[open_, k] = torch.from_numpy(distance)
+    possible = torch.nn.functional.one_hot(nearest.argmin(1), len(rooms)) * torch.isfinite(nearest)
+    return said, possible.float()
 
 
 def islands(

@@ -22,6 +22,7 @@ from physics3d.priors.weights import hub_answers
 from physics3d.segmentation.pixels import bounds, centres, depth_in, eroded, size_of, thinned
 
 SURE = 0.95  # share of a pixel above which it is the object's, and 1 - SURE below which it is not
+UNLIKE = 15.0  # Lab units to the nearest sample: what is in the box and farther resembles nothing outside it
 
 
 class AbstractMasker:
@@ -81,6 +82,11 @@ class GrabCut(AbstractMasker):
             # the surroundings are what lies near the box: sharper colour models, and fewer pixels to cut
             du, dv = (right - left) // 2, (bottom - top) // 2
             near = slice(max(0, top - dv), bottom + dv), slice(max(0, left - du), right + du)
+            if len(positive) and len(negative):
+                inside = slice(top, bottom), slice(left, right)
+                kinds[inside] = np.where(
+                    like_the_clicks(image, inside, near, positive, negative), cv2.GC_PR_FGD, cv2.GC_PR_BGD
+                )
         for points, value in ((positive, cv2.GC_FGD), (negative, cv2.GC_BGD)):
             for u, v in np.floor(points).astype(int).tolist():
                 cv2.circle(kinds, (u, v), reach, value, -1)
@@ -101,6 +107,42 @@ class GrabCut(AbstractMasker):
         left, top, right, bottom = bounds(centres(guess), 0.5, guess.shape, share=1.0).astype(int)
         mask = cut(image, kinds, (slice(top, bottom), slice(left, right)), self.iterations)
         return mask | (without_specks(mask) & guess)
+
+
+def like_the_clicks(
+    image: UInt8[np.ndarray, "h w 3"],
+    inside: tuple[slice, slice],
+    near: tuple[slice, slice],
+    positive: Float[np.ndarray, "p 2"],
+    negative: Float[np.ndarray, "q 2"],
+) -> Bool[np.ndarray, "a b"]:
+    """Pixels in the box that resemble a positive click more than a negative one or what surrounds the box.
+
+    Distance is that to the nearest sample, in Lab colour and, weakly, in place: else what is clicked away but makes up
+    much of the box would teach the colours of the object.
+    """
+    import cv2
+    from scipy.spatial import cKDTree
+
+    height, width = image.shape[:2]
+    colour = cv2.cvtColor(image.astype(np.float32) / 255, cv2.COLOR_RGB2LAB)
+    rows, columns = np.indices((height, width))
+    reach = 60.0 / max(inside[0].stop - inside[0].start, inside[1].stop - inside[1].start)  # Lab units per pixel
+    feature = np.concatenate([colour, reach * columns[..., None], reach * rows[..., None]], -1)
+
+    def under(points):
+        marked = np.zeros((height, width), np.uint8)
+        for u, v in np.floor(points).astype(int).tolist():
+            cv2.circle(marked, (u, v), max(1, round(0.006 * max(height, width))), 1, -1)
+        return marked > 0
+
+    around = np.zeros((height, width), bool)
+    around[near] = True
+    around[inside] = False
+    on, off = under(positive), under(negative)
+    samples = feature[on], np.concatenate([feature[off], thinned(feature[around], 2000)])
+    to_on, to_off = (cKDTree(s).query(feature[inside].reshape(-1, 5))[0] for s in samples)
+    return ((to_on < to_off) | (to_off > UNLIKE)).reshape(feature[inside].shape[:2])
 
 
 def cut(

@@ -1,27 +1,28 @@
 """What a person says about one photograph, carried to the others through the Gaussians.
 
-The mask of the prompted photograph labels the Gaussians that it shows (see `lift`), and unseen ones take the label of
-their neighbours. Drawn from the next camera these labels say of every pixel which share is the object's, and the masker
-finds the outline near there. Views are taken in the order of their angle to the prompted one, and each adds what it
-shows, so that the far side is reached step by step. What is farther behind the prompted view's surface than the object
-is wide is never part of it: prompt a view that shows it large.
+The mask of the prompted photograph labels the Gaussians that it shows (see `lift`); those that it hides may be the
+object's where there is room. Drawn from the next camera this says of every pixel which share is the object's, and the
+masker finds the outline near there. Views are taken in the order of their angle to the prompted one, and each adds what
+it shows, so that the far side is reached step by step. What is farther behind the prompted view's surface than the
+object is wide is never part of it: prompt a view that shows it large.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from physics3d.gaussians.cameras import Camera
 from physics3d.gaussians.model import Gaussians
 from physics3d.gaussians.rasterize import Rendered
 from physics3d.log import Log
-from physics3d.segmentation.lift import contributions, lift, shares
+from physics3d.segmentation.lift import contributions, expected, shares
 from physics3d.segmentation.masks import AbstractMasker, AbstractVideoMasker
 from physics3d.segmentation.pixels import centres, eroded, size_of, thinned
 
+UNSEEN = 0.9  # belief that what may be a part is one, before a view shows it: likely, but never sure
 LEAST_SHOWN = 20  # pixels; a part that shows less in a view is not looked for there
 
 
@@ -198,47 +199,80 @@ def told_apart(
 def carry_masks(
     gaussians: Gaussians,
     first: View,
-    mask: Bool[np.ndarray, "h w"],
-    room: Room,
+    prompted: dict[str, Bool[np.ndarray, "h w"]],
+    rooms: dict[str, Room],
     views: list[View],
     masker: AbstractMasker,
     *,
     log: Log,
-) -> dict[int, Bool[np.ndarray, "h w"]]:
-    """Masks by view index: the first one, and those of the other views that agree with what was carried to them."""
-    mask = mask & ~room.excludes(first)
-    masks = {first.index: mask}
-    followed: dict[int, np.ndarray] = {}
+) -> dict[int, dict[str, Bool[np.ndarray, "h w"]]]:
+    """Masks by view index and part, of the parts prompted in one view together, so that they compete for pixels.
+
+    A view in which the masker finds something else than what was carried to it is left out.
+    """
+    path = along_path(first, views)
+    followed: dict[str, list[np.ndarray]] = {}
     if isinstance(masker, AbstractVideoMasker):
-        path = along_path(first, views)
         start = next(k for k, v in enumerate(path) if v.index == first.index)
-        followed = dict(zip([v.index for v in path], masker.follow([v.image for v in path], start, mask)))
+        followed = {part: masker.follow([v.image for v in path], start, mask) for part, mask in prompted.items()}
     mean = gaussians.mean.cpu()
-    allowed = room.holds(mean)
-    said = lambda view: contributions(gaussians, [view.camera], [torch.from_numpy(masks[view.index]).long()], 2)
-    weights = said(first)
-    towards = lambda view: torch.nn.functional.normalize(view.camera.centre.to(room.centre) - room.centre, dim=0)
+    allowed = torch.stack([rooms[part].holds(mean) for part in prompted])
+    masks = {first.index: {part: mask & ~rooms[part].excludes(first) for part, mask in prompted.items()}}
+    seen_in = lambda view: contributions(
+        gaussians, [view.camera], [torch.from_numpy(numbered(list(masks[view.index].values())))], 1 + len(prompted)
+    )
+    weights = seen_in(first)
+    centre = torch.stack([room.centre for room in rooms.values()]).mean(0)
+    towards = lambda view: torch.nn.functional.normalize(view.camera.centre.to(centre) - centre, dim=0)
     order = sorted((v for v in views if v.index != first.index), key=lambda v: -float(towards(v) @ towards(first)))
     for view in log.progress(order, "carrying the prompt"):
-        (share,) = shares(gaussians, lift(mean, weights) * allowed, 1, view.camera)
-        guess = share > 0.5
-        if guess.sum() < LEAST_SHOWN:
-            log.info(f"{view.name} hardly shows the object, left out")
+        said, possible = expected(mean, weights, allowed)
+        known = shares(gaussians, said, view.camera)
+        drawn = known + UNSEEN * shares(gaussians, possible, view.camera)
+        if all((share > 0.5).sum() < LEAST_SHOWN for share in known):
+            log.info(f"{view.name} hardly shows {' and '.join(prompted)}, left out")
             continue
-        found = followed[view.index] if followed else masker.refine(view.image, share)
-        found &= ~clearly_outside(room, view, guess)
-        agreement = overlap(found, guess)
-        if agreement < 0.5:
-            log.info(f"{view.name}: the mask overlaps what other views say by {100 * agreement:.0f} %, left out")
+        found, recall, leak = {}, 1.0, 0.0
+        for part, sure, share in zip(prompted, known, drawn):
+            mask = np.zeros(share.shape, bool)
+            if (share > 0.5).sum() >= LEAST_SHOWN:  # else it is behind another part
+                mask = followed[part][path.index(view)] if followed else masker.refine(view.image, share)
+                mask = mask & ~clearly_outside(rooms[part], view, share > 0.5) & wins(share, drawn)
+                recall = min(recall, share_of(sure > 0.5, mask))
+                leak = max(leak, share_of(mask, eroded(share < 0.05, 0.1 * size_of(share > 0.5))))
+            found[part] = mask
+        if recall < 0.6 or leak > 0.3:
+            log.info(
+                f"{view.name}: a mask holds {100 * recall:.0f} % of what other views say is the object's, and "
+                f"{100 * leak:.0f} % of it is far off, left out"
+            )
             continue
         masks[view.index] = found
-        weights += said(view)
+        weights += seen_in(view)
     return masks
+
+
+def wins(share: Float[np.ndarray, "h w"], drawn: Float[np.ndarray, "k h w"]) -> Bool[np.ndarray, "h w"]:
+    """Where two parts meet both outlines are guesses: a pixel may only be of the part that shows most there."""
+    return share >= drawn.max(0) - 1e-6
+
+
+def numbered(masks: list[Bool[np.ndarray, "h w"]]) -> Int[np.ndarray, "h w"]:
+    """Map of labels 1, 2, ...; a pixel claimed twice belongs to the part named first."""
+    labelled = np.zeros(masks[0].shape, np.int64)
+    for k in range(len(masks), 0, -1):
+        labelled[masks[k - 1]] = k
+    return labelled
 
 
 def clearly_outside(room: Room, view: View, guess: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """Pixels well inside the area that shows what is outside the room: where thin things end, depth is a mix."""
     return eroded(room.excludes(view), 0.06 * size_of(guess))
+
+
+def share_of(part: Bool[np.ndarray, "h w"], whole: Bool[np.ndarray, "h w"]) -> float:
+    """Share of the part that lies on the whole; 1 for nothing."""
+    return float((part & whole).sum() / part.sum()) if part.any() else 1.0
 
 
 def overlap(a: Bool[np.ndarray, "h w"], b: Bool[np.ndarray, "h w"]) -> float:
@@ -263,20 +297,24 @@ def along_path(first: View, views: list[View]) -> list[View]:
     return path
 
 
-def refined_mask(
-    share: Float[np.ndarray, "h w"], view: View, room: Room | None, masker: AbstractMasker
-) -> Bool[np.ndarray, "h w"]:
-    """Mask of a part from its own labels: `share` of each pixel that Gaussians labelled with it contribute.
+def refined_masks(
+    drawn: Float[np.ndarray, "k h w"], view: View, rooms: list[Room | None], masker: AbstractMasker
+) -> list[Bool[np.ndarray, "h w"]]:
+    """Masks of parts from their own labels: `drawn` are the shares of pixels that Gaussians with each label contribute.
 
     A mask that contradicts the labels is replaced by them.
     """
-    guess = share > 0.5
-    if guess.sum() < LEAST_SHOWN:
-        return np.zeros_like(guess)
-    mask = masker.refine(view.image, share)
-    if room is not None:
-        mask &= ~clearly_outside(room, view, guess)
-    return mask if overlap(mask, guess) > 0.6 else guess
+    found = []
+    for share, room in zip(drawn, rooms):
+        guess = share > 0.5
+        mask = np.zeros_like(guess)
+        if guess.sum() >= LEAST_SHOWN:
+            mask = masker.refine(view.image, share)
+            if room is not None:
+                mask = mask & ~clearly_outside(room, view, guess)
+            mask = (mask if overlap(mask, guess) > 0.6 else guess) & wins(share, drawn)
+        found.append(mask)
+    return found
 
 
 def mask_of_box(prompt: Prompt, view: View, masker: AbstractMasker) -> Bool[np.ndarray, "h w"] | None:

@@ -8,9 +8,9 @@ from analytic_bodies import cameras_around, captured, discs, joined, sphere, sph
 from physics3d.gaussians.rasterize import rasterize
 from physics3d.gaussians.render import render
 from physics3d.log import Log
-from physics3d.segmentation.lift import contributions, islands, lift, shares, touching
-from physics3d.segmentation.masks import GrabCut
-from physics3d.segmentation.prompts import Prompt, Room, View, carry_masks
+from physics3d.segmentation.lift import contributions, expected, islands, lift, one_hot, shares, touching
+from physics3d.segmentation.masks import AbstractVideoMasker, GrabCut
+from physics3d.segmentation.prompts import Prompt, Room, View, along_path, carry_masks, overlap
 
 CAMERAS = cameras_around(10, 0.4)
 
@@ -87,15 +87,25 @@ def test_labels_of_one_view_are_right_where_they_show_in_others(scene):
     seen = [(true_map(gaussians, truth, first) == 1).long()]
     label = lift(gaussians.mean, contributions(gaussians, [first], seen, 2)) * allowed
     for camera in (others[0], others[-1]):
-        (share,) = shares(gaussians, label, 1, camera)
+        (share,) = shares(gaussians, one_hot(label, 1), camera)
         true = (true_map(gaussians, truth, camera) == 1).numpy()
         # 36 degrees on, a tenth of the ball was not seen yet and has the label of its neighbours
         assert ((share > 0.5) & true).sum() / ((share > 0.5) | true).sum() > 0.9
 
 
+def test_what_no_view_has_shown_may_be_of_the_nearest_part_that_has_room():
+    mean = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [0.3, 0, 0], [0.8, 0, 0], [2.0, 0, 0]])
+    weights = torch.tensor([[0.0, 5.0, 0.0], [0.0, 0.0, 5.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [9.0, 0.0, 0.0]])
+    rooms = torch.tensor([[True, True, True, True, True], [True, True, True, False, True]])
+    said, possible = expected(mean, weights, rooms)
+    assert said.tolist() == [[1, 0], [0, 1], [0, 0], [0, 0], [0, 0]]
+    # the third is near the first part; the fourth is near the second, which has no room for it
+    assert possible.tolist() == [[0, 0], [0, 0], [1, 0], [1, 0], [0, 0]]
+
+
 def test_shares_add_up_to_alpha(scene):
     gaussians, truth, _ = scene
-    drawn = shares(gaussians, truth + 1, 3, CAMERAS[0])
+    drawn = shares(gaussians, one_hot(truth + 1, 3), CAMERAS[0])
     alpha = render(gaussians, CAMERAS[0], background=(0.0, 0.0, 0.0)).alpha.numpy()
     # float32 sums of some ten weights
     np.testing.assert_allclose(drawn.sum(0), alpha, atol=1e-5)
@@ -106,13 +116,38 @@ def test_a_mask_reaches_the_far_side(scene):
     a, b, first, *rest = views(gaussians)  # the third shows the red ball whole
     others = [a, b, *rest]
     mask = (true_map(gaussians, truth, first.camera) == 1).numpy()
-    masks = carry_masks(gaussians, first, mask, Room.around(first, mask), [first, *others], GrabCut(), log=Log(None))
+    rooms = {"red": Room.around(first, mask)}
+    masks = carry_masks(gaussians, first, {"red": mask}, rooms, [first, *others], GrabCut(), log=Log(None))
     assert len(masks) >= 9
     for view in others:
         true = (true_map(gaussians, truth, view.camera) == 1).numpy()
         if view.index in masks:
-            found = masks[view.index]
-            assert (found & true).sum() / (found | true).sum() > 0.8, view.name
+            assert overlap(masks[view.index]["red"], true) > 0.8, view.name
+
+
+def test_a_video_masker_gets_the_views_along_the_path_of_the_cameras(scene):
+    first, *others = views(scene[0])
+    path = [v.index for v in along_path(first, [*others[::2], first, *others[1::2]])]
+    steps = np.abs(np.diff(path)) % 10
+    # ten cameras on a circle: neighbours have neighbouring numbers, and first is among them
+    assert sorted(path) == list(range(10)) and set(steps) <= {1, 9}
+
+
+def test_what_a_video_masker_followed_is_carried(scene):
+    gaussians, truth, _ = scene
+    first, *others = views(gaussians)[2:5]
+    true = {v.index: (true_map(gaussians, truth, v.camera) == 1).numpy() for v in (first, *others)}
+
+    class Knows(AbstractVideoMasker):
+        def follow(self, images, start, mask):
+            order = [v.index for v in along_path(first, others)]
+            return [true[i] if i != others[1].index else ~true[i] for i in order]
+
+    rooms = {"red": Room.around(first, true[first.index])}
+    masks = carry_masks(gaussians, first, {"red": true[first.index]}, rooms, others, Knows(), log=Log(None))
+    # and where it lost the object the view is left out
+    assert set(masks) == {first.index, others[0].index}
+    assert overlap(masks[others[0].index]["red"], true[others[0].index]) > 0.95
 
 
 def test_islands_are_the_small_clusters_apart():

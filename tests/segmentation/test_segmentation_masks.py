@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from physics3d.segmentation.masks import GrabCut, Sam2, build_sam2
+from physics3d.segmentation.masks import GrabCut, Sam2, Sam2Video, build_sam2
 
 NOTHING = np.zeros((0, 2))
 
@@ -48,6 +48,28 @@ def test_grabcut_keeps_what_was_pointed_at():
     assert mask[left].mean() > 0.95 and not mask[right].any()
 
 
+def test_grabcut_finds_thin_things_near_a_blunt_guess():
+    rng = np.random.default_rng(0)
+    image, disc = disc_on_noise(rng)
+    stalk, _ = disc_on_noise(rng, radius=500)
+    truth = disc.copy()
+    truth[14:25, 58:62] = True  # four pixels wide, and longer than the guess knows
+    image[truth] = stalk[truth]
+    mask = GrabCut().refine(image, 0.98 * disc.astype(float) + 0.01)
+    # rounded ends, and half a pixel of the outline
+    assert (mask & truth).sum() / (mask | truth).sum() > 0.95 and mask[16:24, 60].all()
+
+
+def test_what_is_clicked_away_teaches_no_colours_of_the_object():
+    rng = np.random.default_rng(0)
+    image, truth = disc_on_noise(rng, centre=(50, 45), radius=18)
+    beside, other = disc_on_noise(rng, centre=(80, 60), radius=14)
+    image[other & ~truth] = (np.roll(beside, 1, 2))[other & ~truth]
+    box, on, off = np.array([25.0, 20, 100, 80]), np.array([[50.0, 45.0]]), np.array([[82.0, 62.0]])
+    mask = GrabCut()(image, box=box, positive=on, negative=off)
+    assert (mask & truth).sum() / (mask | truth).sum() > 0.95
+
+
 def test_sam2_with_random_weights_returns_a_mask_of_the_image(tmp_path):
     from hydra.core.global_hydra import GlobalHydra
 
@@ -62,6 +84,15 @@ def test_sam2_with_random_weights_returns_a_mask_of_the_image(tmp_path):
     for box, positive in ((np.array([30.0, 15, 90, 75]), NOTHING), (None, np.array([[60.0, 45.0]]))):
         mask = masker(image, box=box, positive=positive, negative=np.array([[5.0, 5.0]]))
         assert mask.shape == (100, 120) and mask.dtype == bool
+    refined = masker.refine(image, np.full((100, 120), 0.6))
+    assert refined.shape == (100, 120) and refined.dtype == bool
+
+    # the same weights follow a mask through pictures of different sizes, in both directions
+    _, given = disc_on_noise(np.random.default_rng(0))
+    frames = [image, np.roll(image, 4, 1), np.roll(image, 8, 1)[:80]]
+    found = Sam2Video(still=masker).follow(frames, 1, given)
+    assert [m.shape for m in found] == [(100, 120), (100, 120), (80, 120)] and all(m.dtype == bool for m in found)
+    assert np.array_equal(found[1], given)
 
     with pytest.raises(ValueError, match=r"segment.masker.weights=.* does not fit"):
         torch.save({"model": {"a": torch.zeros(1)}}, weights)
