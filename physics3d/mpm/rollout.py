@@ -462,8 +462,8 @@ class _Solver:
         return math.ceil(self.frame_dt / min(self.world.cfl * limit.crossing, 0.95 * limit.alone))
 
     def _implicit_need(self, now) -> int:
-        """Implicit steps that a frame needs: no particle moves half a cell, turns or stretches by a fifth in one; and if
-        it is not the user who wants them, none is longer than a frame of a film."""
+        """Implicit steps that a frame needs: no particle moves half a cell, turns or stretches by a fifth in one, and
+        unless the user wants them, none is longer than a frame of a film."""
         gain = math.hypot(*self.world.gravity) * self.frame_dt
         speed = (float(now.v.norm(dim=1).max()) + gain) / (0.5 * self.world.dx)
         rate = float(now.L.flatten(1).norm(dim=1).max()) / 0.2
