@@ -237,8 +237,8 @@ def fill(
 ) -> Body:
     """Particles for the Gaussians with label > 0 (part = label - 1), and the embedding of all of them.
 
-    spacing [m]; Gaussians below `opacity` become no particles but are embedded; `interior` False leaves a shell;
-    `sheet_thickness` [m] of thin parts, None takes sqrt(12) times the median least deviation of their Gaussians;
+    spacing [m]; Gaussians below `opacity`, or below half of the median one where that is less, become no particles but
+    are embedded; `interior` False leaves a shell; `sheet_thickness` [m] of thin parts, None takes sqrt(12) times the median least deviation of their Gaussians;
     isolated pieces with less than the share `drop_pieces_below` of the volume are dropped, of the others becomes what
     `isolated` says, see `join_pieces`; `attach` marks the particles beside static Gaussians.
     Raises ValueError if nothing moves, or the lattice would be too large.
@@ -253,6 +253,8 @@ def fill(
             "no Gaussian may move (all labels are 0); correct segment.prompts, see the previews of segment"
         )
     moving = gaussians.select(which)
+    # a model of many faint Gaussians is judged by its own: the half of its median, where that is less
+    opacity = min(opacity, 0.5 * float(moving.opacity.median()))
     solidly = moving.opacity > opacity
     if int(solidly.sum()) < 4:
         raise ValueError(

@@ -17,7 +17,7 @@ class Fill:
     spacing: float  # distance between neighbouring particles [m], half a cell of the simulation grid
     solid: AbstractSolid = field(default_factory=Poisson)  # what counts as inside
     interior: bool = True  # False leaves a shell one to two particles thick
-    opacity: float = 0.1  # fainter Gaussians ride along but become no particles
+    opacity: float = 0.1  # fainter Gaussians, if below half of their median too, ride along but become no particles
     sheet_thickness: float | None = None  # of petals and leaves [m]; null: from the flatness of their Gaussians
     isolated: str = "attach"  # attach | drop | keep: what becomes of pieces more than a cell away from the rest
     drop_pieces_below: float = 0.01  # isolated pieces with less than this share of the volume are dropped

@@ -145,6 +145,14 @@ def test_thickness_is_taken_from_the_gaussians(rng):
     assert float(body.volume.double().sum()) == pytest.approx(0.01 * 12**0.5 * 0.0004, rel=0.07)
 
 
+def test_a_model_of_many_faint_gaussians_is_filled_as_one_of_opaque_ones(rng):
+    """A fit may cover a surface by ten layers of a tenth each: all of them are its surface."""
+    gaussians = discs(*sphere(8000, 0.05, rng), rng)
+    faint = replace(gaussians, opacity_logit=torch.logit(0.06 * gaussians.opacity))
+    assert float(faint.opacity.max()) < WITH["opacity"]
+    assert torch.equal(filled(faint).position, filled(gaussians).position)
+
+
 def test_particles_keep_their_distance(rng):
     from scipy.spatial import cKDTree
 
