@@ -238,8 +238,9 @@ def fill(
     """Particles for the Gaussians with label > 0 (part = label - 1), and the embedding of all of them.
 
     spacing [m]; Gaussians below `opacity`, or below half of the median one where that is less, become no particles but
-    are embedded; `interior` False leaves a shell; `sheet_thickness` [m] of thin parts, None takes sqrt(12) times the median least deviation of their Gaussians;
-    isolated pieces with less than the share `drop_pieces_below` of the volume are dropped, of the others becomes what
+    are embedded; `interior` False leaves a shell; `sheet_thickness` [m] of thin parts, None takes sqrt(12) times the
+    median least deviation of their Gaussians; isolated pieces with less than the share `drop_pieces_below` of the
+    volume are dropped, of the others becomes what
     `isolated` says, see `join_pieces`; `attach` marks the particles beside static Gaussians.
     Raises ValueError if nothing moves, or the lattice would be too large.
     """
