@@ -259,7 +259,8 @@ def fill(
     solidly = moving.opacity > opacity
     if int(solidly.sum()) < 4:
         raise ValueError(
-            f"only {int(solidly.sum())} of {len(which)} moving Gaussians are above fill.opacity = {opacity:g}; lower it"
+            f"only {int(solidly.sum())} of {len(which)} moving Gaussians are opaque enough for a surface; correct "
+            "segment.prompts, see the previews of segment"
         )
     reliable = torch.nonzero(solidly).flatten()
     reliable = reliable[torch.from_numpy(without_floaters(moving.mean[reliable].double().numpy()))]

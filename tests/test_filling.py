@@ -305,7 +305,7 @@ def test_nonsense_is_refused_with_a_remedy(rng):
         filled(gaussians, spacing=0.0)
     with pytest.raises(ValueError, match=r"fill.spacing = 1e-05 m cuts .* take at least"):
         filled(gaussians, spacing=1e-5)
-    with pytest.raises(ValueError, match=r"fill.opacity = 0.99; lower"):
-        filled(gaussians, opacity=0.99)
+    with pytest.raises(ValueError, match=r"only 3 of 3 moving Gaussians .* segment.prompts"):
+        filled(gaussians, label=(torch.arange(1000) < 3).to(torch.int32))
     with pytest.raises(ValueError, match=r"fill.isolated is 'burn'; take one of attach"):
         filled(gaussians, isolated="burn")
