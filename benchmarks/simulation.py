@@ -278,8 +278,9 @@ def findings(rows: list[dict]) -> list[str]:
         explicit = line_of(rows, problem, "cfl 0.5", "float64")
         for times in IMPLICIT:
             line = line_of(rows, problem, f"implicit, {times} x limit", "float64")
-            if explicit and line:
-                a, b = explicit[-1], line[-1]
+            if line and any(r["size"] == line[-1]["size"] for r in explicit):
+                b = line[-1]
+                a = next(r for r in explicit if r["size"] == b["size"])
                 sentences.append(
                     f"{problem}, {b['size']}: implicit steps of {times} times the explicit limit take "
                     f"{b['seconds'] / a['seconds']:.2g} times as long, error {b['error']:.1e} instead of "

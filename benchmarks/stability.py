@@ -581,7 +581,7 @@ def page(cells: list[dict], extremes: list[dict], title: str) -> str:
         "substep, and there the logarithmic law gains energy, explicitly: 15 % at cfl 0.5, 3 % at 0.1, 0.5 % at 0.02.",
         "A fluid of 1e12 Pa s has stresses of 1e12 times the shear rate, beside which its inertia is lost in rounding:",
         "Newton's method does not converge in float64 either, and the scene is refused. In float32 the implicit",
-        "scheme lets a body of 1e9 Pa s burst, probably because rounding passes for convergence: the one known failure.",
+        "scheme lets a body of 1e9 Pa s burst, probably as rounding passes for convergence: the one known failure.",
         "",
     ]  # fmt: skip
     lines += ["| scheme | " + " | ".join(OUTCOMES) + " |", "|---" * 5 + "|"]
