@@ -37,6 +37,7 @@ RESULTS = Path(__file__).resolve().parent.parent / "docs" / "results"
 PHOTOGRAPHS, WIDTH, GAUSSIANS, SEED = 40, 320, 16_000, 0
 VIEWS, SIZES, ROUNDS = (6, 10, 16, 24, 40), (120, 160, 240, 320), (0, 1, 2, 3)
 MANY, ASKED = 16, {"pixel": 0.97, "gaussian": 0.95}
+FRESH = (1, 2, 3)  # other flowers, never looked at while the method was made; the ball has only one look
 PARTS = ("stem", "blossom", "pot")
 SHIPPED: dict[str, tuple[str, dict[str, str]]] = {  # twin -> scene, names of its parts
     "plant": ("carnation", {}),
@@ -63,6 +64,18 @@ def main() -> None:
         plans += [(MANY, s, 2) for s in SIZES if s != WIDTH] if name in ("plant", "ball") else []
         for views, size, rounds in plans:
             rows += measure(name, "on the meshes", twin, model, truth, prompts[name], views, size, rounds)
+    for seed in FRESH:
+        fresh = {
+            "plant": carnation(("plant",), views=PHOTOGRAPHS, width=WIDTH, seed=seed, log=QUIET),
+            "stem, blossom, pot": carnation(PARTS, views=PHOTOGRAPHS, width=WIDTH, seed=seed, log=QUIET),
+        }
+        for name, twin in fresh.items():
+            TRUE.clear()
+            model, truth = twin.gaussians(GAUSSIANS, seed)
+            rows += measure(
+                name, f"on the meshes, fresh seed {seed}", twin, model, truth, twin.prompts(3, clicks=3), MANY, WIDTH, 2
+            )
+    TRUE.clear()
     model = Reconstruct(iterations=1000, max_gaussians=12_000, seed=SEED)(plant.capture, log=QUIET)
     for name in list(twins)[:3]:
         twin = twins[name]
@@ -192,6 +205,16 @@ def verdicts(rows: list[dict]) -> list[str]:
                 f"{row['seconds']:.0f} s of CPU. Asked: {ASKED['pixel']} and {ASKED['gaussian']}, "
                 f"{'met' if met else 'not met'}."
             )
+    small = [r for r in rows if r["twin"] == "ball" and r["size"] < WIDTH]
+    coarse = ", ".join(f"{r['size']} px {r['pixel']:.2f}" for r in small)
+    lines += [
+        "- The thresholds of the method, the rule that places clicks and the clicks in conf/scene were chosen while "
+        f"looking at the truth of the twins of seed {SEED}: theirs are values of a set that was tuned on. Nothing was "
+        f"changed for the fresh seeds {', '.join(map(str, FRESH))}, which vary petals, leaves, soil and pot, but "
+        "neither cameras nor the kind of scene.",
+        f"- The ball with masks below {WIDTH} px: {coarse} per pixel. Its far side has other colours, which coarse "
+        "masks do not carry; the mask of the prompted view itself is right.",
+    ]
     lines.append("- SAM 2 has not been measured: its weights were not at hand. The tests run it with random weights.")
     return lines
 
