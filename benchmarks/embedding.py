@@ -185,7 +185,7 @@ def cut_ball() -> tuple[dict, np.ndarray]:
     ball = Gaussians(**(vars(ball) | {"sh": torch.tensor((colour - 0.5) / C0).float()[:, None]}))
     body = fill(
         ball, torch.ones(len(ball), dtype=torch.int32), spacing=0.004, opacity=0.1, solid=Poisson(), interior=True,
-        sheet_thickness=None, isolated="keep", drop_pieces_below=0.0, attach=False, log=Log(None),
+        sheet_thickness=None, isolated="keep", drop_pieces_below=0.0, attach=False, cameras=(), log=Log(None),
     )  # fmt: skip
     X, still = body.position, torch.eye(3).expand(len(body.position), 3, 3)
     cameras = [camera((0.25 * math.cos(a), 0.25 * math.sin(a), 0.1)) for a in np.arange(8) * math.pi / 4]

@@ -114,6 +114,7 @@ def filled(gaussians: Gaussians, solid: AbstractSolid, thin: bool) -> Body:
         isolated="keep",
         drop_pieces_below=0.0,
         attach=False,
+        cameras=(),
         log=Log(None),
     )
 

@@ -16,7 +16,7 @@ Poisson reconstruction: Kazhdan, Hoppe (2013). All lengths in metres.
 """
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +27,7 @@ from scipy.spatial import Delaunay, QhullError, cKDTree
 from torch import Tensor
 
 from physics3d.artifact import AbstractArtifact, require_finite
+from physics3d.gaussians.cameras import Camera
 from physics3d.gaussians.deform import Embedding, embed
 from physics3d.gaussians.model import Gaussians
 from physics3d.log import Log
@@ -34,6 +35,7 @@ from physics3d.mpm.boundaries.base import AbstractBoundary
 from physics3d.mpm.boundaries.fixed_region import FixedRegion
 from physics3d.mpm.boundaries.held_particles import HeldParticles
 from physics3d.open3d_import import open3d
+from physics3d.seen import Seen, seen
 
 DIRECTIONS = np.array(
     [d for d in itertools.product((-1, 0, 1), repeat=3) if any(d)]
@@ -233,6 +235,7 @@ def fill(
     isolated: str,
     drop_pieces_below: float,
     attach: bool,
+    cameras: Sequence[Camera],
     log: Log,
 ) -> Body:
     """Particles for the Gaussians with label > 0 (part = label - 1), and the embedding of all of them.
@@ -277,8 +280,16 @@ def fill(
 
     shown = moving.select(reliable)
     static = gaussians.select((label == 0) & (gaussians.opacity > opacity))
-    surface, deviation = sample_surface(shown, spacing, beside=static)
-    position, volume = solid_cells(solid.inside(surface, spacing), surface.point, spacing)
+    view = None
+    if cameras:
+        at = shown.mean.double().numpy()
+        box = dict(lower=at.min(0) - 2 * spacing, upper=at.max(0) + 2 * spacing)
+        view = seen(gaussians, label, cameras, **box, spacing=spacing, log=log)
+    surface, deviation = sample_surface(shown, spacing, beside=static, view=view)
+    inside = solid.inside(surface, spacing)
+    position, volume = solid_cells(
+        inside if view is None else lambda x: inside(x) & ~view.beside(x), surface.point, spacing
+    )
     distance, _ = cKDTree(surface.point).query(position) if len(position) else (np.zeros(0), None)
     inner = distance > spacing
     solid_volume = volume.sum()
@@ -354,10 +365,13 @@ def spread(gaussians: Gaussians, step: float) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(points), np.concatenate(owners)
 
 
-def sample_surface(gaussians: Gaussians, spacing: float, beside: Gaussians | None = None) -> tuple[Surface, np.ndarray]:
+def sample_surface(
+    gaussians: Gaussians, spacing: float, *, beside: Gaussians | None = None, view: Seen | None = None
+) -> tuple[Surface, np.ndarray]:
     """Samples about half a spacing apart, and the least deviation [m] of the Gaussians at each.
 
-    `beside` are Gaussians that do not belong to the body but hide the sky: what it stands on or leans against.
+    `beside` are Gaussians that do not belong to the body but hide the sky: what it stands on or leans against. `view`
+    is what cameras see: samples of solid parts are moved onto its surface, those not near it are inside and left out.
     """
     step = spacing / 2
     point, owner = spread(gaussians, step)
@@ -398,6 +412,11 @@ def sample_surface(gaussians: Gaussians, spacing: float, beside: Gaussians | Non
     normal = np.where((front >= back)[:, None], normal, -normal)
     more, less = np.maximum(front, back), np.minimum(front, back)
     thin, hidden = (less > 0.6 * more) & (more > 0.02), more <= 0.02
+    if view is not None:
+        moved, outside, found = view.settled(point, 1.5 * spacing)
+        solid = ~thin & ~hidden
+        point, normal = (np.where((solid & found)[:, None], a, b) for a, b in ((moved, point), (outside, normal)))
+        return Surface(point, normal, enclosure, thin=thin, hidden=hidden | (solid & ~found)), deviation
     # what is seen of a fitted Gaussian is its outer side, a deviation away from its centre
     outward = np.where(thin | hidden, 0.0, deviation)[:, None] * normal
     return Surface(point + outward, normal, enclosure, thin=thin, hidden=hidden), deviation

@@ -44,7 +44,7 @@ def plan(config: dict[str, Any], capture: Step) -> Plan:
     guess = step("guess")
     gaussians = capture.part("gaussians") if "reconstruct" in without else step("reconstruct", capture)
     segmentation = None if "segment" in without else step("segment", capture, gaussians)
-    body = step("fill", gaussians, segmentation)
+    body = step("fill", capture, gaussians, segmentation)
     estimate = guess if "learn" in without else step("learn", capture, gaussians, body)
     trajectory = step("simulate", body, estimate)
     video = step("render", capture, gaussians, body, trajectory)

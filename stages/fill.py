@@ -7,6 +7,7 @@ import torch
 from physics3d.filling import AbstractSolid, Body, Poisson, fill
 from physics3d.gaussians.model import Gaussians
 from physics3d.log import Log
+from physics3d.scenes.base import Capture
 from physics3d.segmentation import Segmentation
 
 VISIBLE = 1 / 255  # opacity below which a Gaussian is never drawn
@@ -23,7 +24,7 @@ class Fill:
     drop_pieces_below: float = 0.01  # isolated pieces with less than this share of the volume are dropped
     attach: str = "auto"  # auto | none: hold what touches static Gaussians, where the scene names no fixed region
 
-    def __call__(self, gaussians: Gaussians, segmentation: Segmentation | None, *, log: Log) -> Body:
+    def __call__(self, capture: Capture, gaussians: Gaussians, segmentation: Segmentation | None, *, log: Log) -> Body:
         """Without a segmentation everything visible moves. Raises ValueError if nothing does."""
         if self.attach not in ("auto", "none"):
             raise ValueError(f"fill.attach is {self.attach!r}; take auto or none")
@@ -46,6 +47,7 @@ class Fill:
             isolated=self.isolated,
             drop_pieces_below=self.drop_pieces_below,
             attach=self.attach == "auto",
+            cameras=capture.cameras,
             log=log,
         )
         body = replace(body, parts=("body",) if segmentation is None else segmentation.parts)

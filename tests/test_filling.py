@@ -59,6 +59,7 @@ WITH = {
     "isolated": "keep",
     "drop_pieces_below": 0.0,
     "attach": False,
+    "cameras": (),
     "log": Log(None),
 }
 

@@ -27,7 +27,7 @@ from typing import Any
 
 import torch
 import warp as wp
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from physics3d.artifact import require_finite
@@ -47,6 +47,7 @@ class Rendered:
     alpha: Float[Tensor, "h w"]
     depth: Float[Tensor, "h w"]  # expected depth along the optical axis [m]; 0 where alpha is 0
     median: Float[Tensor, "h w"] | None = None  # median depth [m] if asked for; 0 where alpha is below 1/2
+    at: Int[Tensor, "h w"] | None = None  # with it: index of the Gaussian whose depth that is, -1 where there is none
 
 
 def rasterize(
@@ -75,7 +76,8 @@ def rasterize(
     pose = camera.world_to_camera
     options = (camera, antialiased, median, numerics, tiles)
     picture, alpha, depth, middle = _Splat.apply(mean, covariance, opacity, color, behind, pose, *options)
-    return Rendered(color=picture, alpha=alpha, depth=depth, median=_depth_of(middle, mean, pose) if median else None)
+    rest = dict(median=_depth_of(middle, mean, pose), at=middle) if median else {}
+    return Rendered(color=picture, alpha=alpha, depth=depth, **rest)
 
 
 def tiles_of(

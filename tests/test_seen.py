@@ -1,0 +1,107 @@
+"""Laws of what cameras see of a body: it is as large as its pictures, wherever a fit has put its Gaussians."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from analytic_bodies import discs, joined, sphere
+
+from physics3d.filling import Poisson, fill
+from physics3d.gaussians.cameras import Camera, look_at
+from physics3d.gaussians.model import Gaussians
+from physics3d.gaussians.render import render
+from physics3d.log import Log
+from physics3d.seen import seen
+
+RADIUS, SPACING = 0.05, 0.006  # [m]
+
+
+def around(count: int = 24, distance: float = 0.4, width: int = 160) -> list[Camera]:
+    """Cameras on a spiral over the sphere, all looking at the origin; a pixel is 1.6 mm there."""
+    at = (np.arange(count) + 0.5) / count
+    height, turn = 1 - 2 * at, np.pi * (1 + 5**0.5) * np.arange(count)
+    flat = np.sqrt(1 - height**2)
+    places = distance * np.stack([flat * np.cos(turn), flat * np.sin(turn), height], 1)
+    pose = [look_at(torch.from_numpy(p), torch.zeros(3)) for p in places]
+    return [
+        Camera(width=width, height=width, fx=250, fy=250, cx=width / 2, cy=width / 2, world_to_camera=m) for m in pose
+    ]
+
+
+def ball(rng, depth: float, deviation: float, opacity: float) -> Gaussians:
+    """Round Gaussians with centres up to `depth` [m] below the surface of a ball, evenly in depth."""
+    point, normal = sphere(9000, RADIUS, rng)
+    point = point - depth * rng.random((len(point), 1)) * normal
+    made = discs(point, normal, rng, sigma=deviation, thickness=deviation)
+    return replace(made, opacity_logit=torch.full((len(point),), float(np.log(opacity / (1 - opacity)))))
+
+
+def radius_in_pictures(gaussians: Gaussians, cameras: list[Camera]) -> float:
+    """Of a ball at the origin, from the area in which it hides more than half of what is behind [m]."""
+    found = []
+    for camera in cameras:
+        alpha = render(gaussians, camera, background=(0.0, 0.0, 0.0)).alpha
+        tangent = np.sqrt(float((alpha > 0.5).sum()) / np.pi) / camera.fx
+        found.append(float(camera.centre.norm()) * np.sin(np.arctan(tangent)))
+    return float(np.mean(found))
+
+
+def filled(gaussians: Gaussians, cameras: list[Camera], label=None):
+    return fill(
+        gaussians,
+        torch.ones(len(gaussians), dtype=torch.int32) if label is None else label,
+        spacing=SPACING,
+        opacity=0.1,
+        solid=Poisson(),
+        interior=True,
+        sheet_thickness=None,
+        isolated="keep",
+        drop_pieces_below=0.0,
+        attach=False,
+        cameras=cameras,
+        log=Log(None),
+    )
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)
+
+
+@pytest.mark.parametrize(
+    ("depth", "deviation", "opacity"), [(0.0, 0.002, 0.9), (0.006, 0.004, 0.3), (0.025, 0.003, 0.3)]
+)
+def test_a_body_is_as_large_as_its_pictures_wherever_its_gaussians_lie(depth, deviation, opacity, rng):
+    gaussians, cameras = ball(rng, depth, deviation, opacity), around()
+    truth = radius_in_pictures(gaussians, cameras)
+    volume = float(filled(gaussians, cameras).volume.double().sum())
+    # one pixel; the centres lie 5 to 30 mm inside
+    assert (volume * 3 / (4 * np.pi)) ** (1 / 3) == pytest.approx(truth, abs=1.6e-3)
+
+
+def test_what_hides_a_body_takes_nothing_from_it(rng):
+    """A static plate before half of the cameras: they say nothing of what is behind it."""
+    gaussians, cameras = ball(rng, 0.006, 0.004, 0.3), around()
+    side = np.stack([np.full(4000, 0.09), *rng.uniform(-0.15, 0.15, (2, 4000))], 1)
+    plate = discs(side, np.tile([1.0, 0.0, 0.0], (4000, 1)), rng, sigma=0.006)
+    both = joined(gaussians, plate)
+    label = torch.cat([torch.ones(len(gaussians)), torch.zeros(len(plate))]).int()
+    alone, beside = filled(gaussians, cameras), filled(both, cameras, label)
+    assert float(beside.volume.sum()) == pytest.approx(float(alone.volume.sum()), rel=0.02)
+
+
+def test_distances_are_those_of_the_surface(rng):
+    """... to two thirds of a pixel in the mean, and one for most."""
+    gaussians, cameras = ball(rng, 0.0, 0.002, 0.9), around()
+    truth = radius_in_pictures(gaussians, cameras)
+    box = dict(lower=np.full(3, -0.07), upper=np.full(3, 0.07))
+    view = seen(gaussians, torch.ones(len(gaussians)).int(), cameras, **box, spacing=SPACING, log=Log(None))
+    assert view.truncation == pytest.approx(0.75 * SPACING)
+    x = sphere(2000, 1.0, rng)[0] * (truth + rng.uniform(-0.002, 0.002, (2000, 1)))
+    moved, normal, found = view.settled(x, SPACING)
+    error = np.linalg.norm(moved, axis=1) - truth
+    assert found.mean() > 0.98
+    assert abs(error[found].mean()) < 1.1e-3 and np.quantile(np.abs(error[found]), 0.9) < 1.6e-3
+    assert ((normal * moved).sum(1)[found] > 0.9 * truth).mean() > 0.98  # outward, to 25 degrees
+    assert view.beside(2.0 * x).all() and not view.beside(0.9 * x).any()
