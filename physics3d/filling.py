@@ -35,7 +35,7 @@ from physics3d.mpm.boundaries.base import AbstractBoundary
 from physics3d.mpm.boundaries.fixed_region import FixedRegion
 from physics3d.mpm.boundaries.held_particles import HeldParticles
 from physics3d.open3d_import import open3d
-from physics3d.seen import Seen, seen
+from physics3d.seen import Seen, ground, seen
 
 DIRECTIONS = np.array(
     [d for d in itertools.product((-1, 0, 1), repeat=3) if any(d)]
@@ -280,16 +280,26 @@ def fill(
 
     shown = moving.select(reliable)
     static = gaussians.select((label == 0) & (gaussians.opacity > opacity))
-    view = None
+    view, below = None, None
     if cameras:
         at = shown.mean.double().numpy()
         box = dict(lower=at.min(0) - 2 * spacing, upper=at.max(0) + 2 * spacing)
         view = seen(gaussians, label, cameras, **box, spacing=spacing, log=log)
+        below = ground(gaussians, label, cameras, **box, spacing=spacing, log=log)
     surface, deviation = sample_surface(shown, spacing, beside=static, view=view)
-    inside = solid.inside(surface, spacing)
-    position, volume = solid_cells(
-        inside if view is None else lambda x: inside(x) & ~view.beside(x), surface.point, spacing
-    )
+    within = solid.inside(surface, spacing)
+
+    def inside(x: np.ndarray) -> np.ndarray:
+        found = within(x)
+        if view is not None:
+            found &= ~view.beside(x)
+        if (
+            view is not None and below is not None
+        ):  # a spacing deep, for it is a guess under the body; what is seen of the body is none
+            found[found] &= ~(view.deep(x[found]) & (below(x[found]) > spacing))
+        return found
+
+    position, volume = solid_cells(inside, surface.point, spacing)
     distance, _ = cKDTree(surface.point).query(position) if len(position) else (np.zeros(0), None)
     inner = distance > spacing
     solid_volume = volume.sum()

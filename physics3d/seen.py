@@ -6,14 +6,17 @@ is its pictures. A camera tells of a point x at depth z, with the pixel it falls
     outline    (1/2 - m) / |slope of m|, m the share of the pixel that is the body's: where m < 1/2, x is not the body's
                unless something static hides it
     depth      d - z where m >= 1/2 and z < d + t: in front of what is seen there, or just behind it; d is the depth of
-               the Gaussian at which half the light is gone, less twice its deviation along the ray
+               the Gaussian at which half the light is gone, less its deviation along the ray
 
 Outlines exclude: the distance is the second largest of all cameras, so that one mistaken mask carves nothing. Depths
 are uncertain: the distance is their mean, cut off at the truncation t (Curless and Levoy 1996). The larger of the two
 holds. What no camera sees keeps -t.
+
+What the body stands on or leans against bounds it where no camera looks: `ground` is the same surface of the static
+Gaussians around it, closed under the body by Poisson reconstruction.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,12 +29,15 @@ from physics3d.gaussians.cameras import Camera
 from physics3d.gaussians.model import Gaussians
 from physics3d.gaussians.rasterize import rasterize
 from physics3d.log import Log
+from physics3d.open3d_import import open3d
 
 MOST_VIEWS = 32
 MOST_POINTS = 3_000_000  # of the lattice
 PER_SPACING = 3  # points of the lattice
 EDGE = 2.0  # [px] over which the share of an edge falls from 1 to 0: low pass, pixel and the Gaussians' own slope
-LIMB = 2.0  # outlines lie that many standard deviations outside the centres: the layers along a grazing ray add up
+LIMB = 1.0  # what is seen of a Gaussian is its outer side, that many deviations before its centre
+GROUND = 0.5  # how far around the body static Gaussians are looked at, of its size
+LEAST_GROUND = 100  # of them
 FAR = 1e6  # depth where nothing is seen [m]
 
 
@@ -41,6 +47,7 @@ class Seen:
     h: float  # distance of its points [m]
     distance: np.ndarray  # [i, j, k] signed, positive outside, cut off at +- truncation [m]
     outline: np.ndarray  # [i, j, k] the same, by outlines alone
+    unseen: np.ndarray  # [i, j, k] 1 where no camera looks: more than the truncation behind a surface; else 0
     truncation: float  # [m]
 
     def _at(self, field: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -49,6 +56,10 @@ class Seen:
     def beside(self, x: np.ndarray) -> np.ndarray:
         """Bool [m]: points [m, 3] that the cameras see past the body."""
         return self._at(self.outline, x) > 0
+
+    def deep(self, x: np.ndarray) -> np.ndarray:
+        """Bool [m]: points [m, 3] behind a surface by more than the truncation, out of sight."""
+        return self._at(self.unseen, x) > 0.5
 
     def settled(self, x: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Points [m, 3] moved onto the surface, at most `reach` [m]; its outward normals there; which have found it."""
@@ -98,23 +109,71 @@ def seen(
         deviation = torch.einsum("ni,nij,nj->n", ray, precision, ray).rsqrt().float()  # of the depth [m]
         at, median = drawn.at.long().cpu(), drawn.median.cpu()  # type: ignore[union-attr]
         front = torch.where(at >= 0, median - LIMB * deviation[at], FAR)
-        cover = torch.where((at >= 0) & (moves[at] == 0), front, FAR)  # what is static and may hide the body
+        body = (at >= 0) & (moves.cpu()[at] > 0)
+        shown_at, hidden_at = torch.where(body, front, -FAR), torch.where(body, FAR, front)
         uv, z = camera.project(x)
         within = (z > 0) & (uv >= 0).all(1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
         pixel = 2 * uv / torch.tensor([camera.width, camera.height]) - 1
         share = _read(drawn.color[..., 0].cpu(), pixel, "bilinear")
-        d, hidden = _read(front, pixel, "nearest"), _read(cover, pixel, "nearest")
+        d, hidden = _read(shown_at, pixel, "nearest"), _read(hidden_at, pixel, "nearest")
         past = ((0.5 - share) * EDGE / camera.fx * z).clamp(-t, t)
         past = torch.where(within & ((share >= 0.5) | (z < hidden - t)), past, -t)
         second = torch.maximum(second, torch.minimum(outline, past))
         outline = torch.maximum(outline, past)
-        near = within & (share >= 0.5) & (z < d + t)
+        near = within & (z < d + t)
         total += torch.where(near, (d - z).clamp(max=t), 0)
         looks += near
-    distance = torch.where(looks > 0, total / looks.clamp_min(1), -t)
-    fields = [f.reshape(*count).double().numpy() for f in (torch.maximum(distance, second), second)]
-    smooth = [ndimage.gaussian_filter(f, 0.7) for f in fields]
-    return Seen(lower=lower, h=h, distance=smooth[0], outline=smooth[1], truncation=t)
+    unseen = looks < min(2, len(which))  # one camera alone may be mistaken
+    distance = torch.where(unseen, -t, total / looks.clamp_min(1))
+    lattice = lambda values: values.reshape(*count).double().numpy()
+    smooth = lambda values: ndimage.gaussian_filter(lattice(values), 0.7)
+    return Seen(
+        lower=lower,
+        h=h,
+        distance=smooth(torch.maximum(distance, second)),
+        outline=smooth(second),
+        unseen=lattice(unseen),
+        truncation=t,
+    )
+
+
+def ground(
+    gaussians: Gaussians,
+    label: Int[Tensor, " n"],
+    cameras: Sequence[Camera],
+    *,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    spacing: float,
+    log: Log,
+) -> Callable[[np.ndarray], np.ndarray] | None:
+    """How deep points [m, 3] lie behind what is static around the box of a body [m], positive behind; None if there is
+    too little of it to say. Seen at half the resolution of the body, `spacing` [m]."""
+    reach = GROUND * float((upper - lower).max())
+    box = dict(lower=lower - reach, upper=upper + reach)
+    mean = gaussians.mean.double()
+    around = (mean > torch.from_numpy(box["lower"])).all(1) & (mean < torch.from_numpy(box["upper"])).all(1)
+    static = gaussians.mean[around & (label == 0)].double().numpy()
+    if len(static) < LEAST_GROUND:
+        return None
+    view = seen(gaussians, (label == 0).int(), cameras, **box, spacing=2 * spacing, log=log)
+    point, normal, found = view.settled(static, 4 * spacing)
+    found &= view.deep(point - 1.5 * view.truncation * normal)  # not a sheet with a view of its other side
+    if found.sum() < LEAST_GROUND:
+        return None
+    o3d = open3d()
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(point[found]))
+    cloud.normals = o3d.utility.Vector3dVector(normal[found])
+    depth = int(np.clip(np.ceil(np.log2((upper - lower + 2 * reach).max() / (2 * spacing))), 6, 8))
+    mesh, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, n_threads=1)
+    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+    scene.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(mesh))
+
+    def behind(x: np.ndarray) -> np.ndarray:
+        nearest = scene.compute_closest_points(o3d.core.Tensor(x.astype(np.float32)))
+        return -((x - nearest["points"].numpy()) * nearest["primitive_normals"].numpy()).sum(1)
+
+    return behind
 
 
 def _read(picture: Float[Tensor, "h w"], pixel: Float[Tensor, "m 2"], mode: str) -> Float[Tensor, " m"]:
