@@ -344,7 +344,10 @@ class ImplicitSubsteps:
         self.grid = wp.to_torch(sub.grid)[:, : self.count]
         self.nodes = wp.to_torch(sub.node_velocity)[: self.count]
         self.grid.zero_()
-        self._on_particles("push", "scatter")
+        if "mark" in sub.kernels:
+            for w in range(sub.workers):
+                sub._new_stamp(w)
+        self._on_particles("push", "scatter", "mark")
         self._sum(self.grid)
         self.base = self.grid[0].clone()
         self.momentum, m = self.base.split((3, 1), 1)
@@ -698,7 +701,7 @@ class ImplicitSubsteps:
             return launch(sub.kernels[kernel], *arguments[kernel], adjoints)
 
         real = self.real
-        if name in ("push", "gather", "steer", "advance"):
+        if name in ("push", "mark", "gather", "steer", "advance"):
             return launch(sub.kernels[name], *arguments[name]) if name in sub.kernels else None
         if name in ("update", "update_still"):
             return launch(sub.kernels["update"], *arguments["update"])

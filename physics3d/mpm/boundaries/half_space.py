@@ -63,6 +63,9 @@ class HalfSpace(base.AbstractBoundary):
     def node(self, real: type) -> wp.Function:
         return _node(real, self.kind)
 
+    def touch(self, real: type) -> wp.Function | None:
+        return _touch(real) if self.kind == "separate" else None
+
 
 @functools.cache
 def coulomb(real: type) -> wp.Function:
@@ -80,6 +83,26 @@ def coulomb(real: type) -> wp.Function:
         return result
 
     return friction
+
+
+@functools.cache
+def _touch(real: type) -> wp.Function:
+    vec3 = vector(real)
+
+    @wp.func(name=f"half_space_touch_{real.__name__}")
+    def touch(
+        x: vec3,
+        radius: real,
+        q: wp.array(dtype=real),
+        a: int,
+        clock: wp.array2d(dtype=real),
+        row: int,
+        b: int,
+    ):
+        n = vec3(q[a + 3], q[a + 4], q[a + 5])
+        return wp.dot(n, x - vec3(q[a], q[a + 1], q[a + 2])) <= radius + q[a + 7]
+
+    return touch
 
 
 @functools.cache
