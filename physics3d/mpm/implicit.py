@@ -288,7 +288,9 @@ class ImplicitSubsteps:
         before, residual = math.inf, self._residual(v)
         size = self._norm(residual)
         while True:
-            goal = self.tolerance * (self._spread(free) + self._spread(v)) + self._noise(v)
+            # a body that falls from rest has no spread and, so far, no speed
+            rounding = self._noise(v) + self.rounding * self._norm(free)
+            goal = self.tolerance * (self._spread(free) + self._spread(v)) + rounding
             # within thirty of it, a residual that has stopped falling is rounding too
             if size <= goal or 0.5 * before <= size <= 30 * goal:
                 return Step(v, newton, products)

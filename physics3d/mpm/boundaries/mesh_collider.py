@@ -8,8 +8,8 @@ after that it stands still:
     v_c(x) = (p(t + dt) - p(t))/dt + (R(t + dt) R(t)^T - I)/dt (x - p(t))
 
 so that what moves along with it keeps its shape, whatever dt. Nodes in the mesh, phi(y) <= 0, obey the rules of
-`half_space` with the normal n = grad phi/|grad phi| and the velocity v - v_c. Where phi has no gradient (a middle
-surface) they stick.
+`half_space` with the normal n = grad phi/|grad phi| and the velocity v - v_c, and where these ask whether a particle
+touches, it does with phi <= V_p^(1/3)/2. Where phi has no gradient (a middle surface) nodes stick.
 
 The signed distance phi is sampled once, with half the grid spacing, by Open3D, and interpolated trilinearly; it rides
 in `parameters`, the pose in `signals`. What is thinner than two cells may let material through. In a scene:
@@ -43,7 +43,7 @@ from physics3d.open3d_import import open3d
 
 SUFFIXES = (".obj", ".ply", ".stl")
 MOST_SAMPLES = 2**22
-HEAD = 9  # parameters before the samples
+HEAD = 10  # parameters before the samples
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +81,8 @@ class MeshCollider(base.AbstractBoundary):
         base.require_window(self)
 
     def parameters(self, setting: base.Setting) -> Float[Tensor, " k"]:
-        """Corner of the samples (3) [m], 1/h [1/m], samples along each axis (3), friction, slack [m], then phi [m]."""
+        """Corner of the samples (3) [m], 1/h [1/m], samples along each axis (3), friction, the largest phi of a node of
+        the mesh and what is forgiven a particle [m]; then phi [m]."""
         vertices, triangles = self._mesh()
         placed = self.scale * vertices @ _turn(np.array(self.rotation)).T
         spacing = setting.dx / 2
@@ -103,8 +104,10 @@ class MeshCollider(base.AbstractBoundary):
         samples = _distance(
             placed.tobytes(), triangles.tobytes(), tuple(corner.tolist()), tuple(count.tolist()), spacing
         )
-        # a node on the surface belongs to the mesh whatever the rounding
-        head = [*corner, 1 / spacing, *count, self.friction, 1e-3 * setting.dx]
+        # what is on the surface belongs to the mesh whatever the rounding
+        slack = 1e-3 * setting.dx
+        reach = base.NEAREST * setting.dx if self.kind == "separate" else slack
+        head = [*corner, 1 / spacing, *count, self.friction, reach, slack]
         return torch.cat([torch.tensor(head, dtype=torch.float64), samples.to(torch.float64)])
 
     def signals(self, t: float, dt: float) -> tuple[float, ...]:
@@ -208,7 +211,7 @@ def _turn(w: np.ndarray) -> np.ndarray:
 
 @functools.cache
 def _field(real: type) -> tuple[wp.Function, wp.Function]:
-    """Warp functions matrix_at(clock, row, b), and field(x, q, a, clock, row, b): the gradient of phi and phi [m] there,
+    """Warp functions matrix_at(clock, row, b), and field(x, q, a, clock, row, b): the gradient of phi and phi [m] at x;
     (0, 0, 0) and infinity away from the samples."""
     vec3, vec4, mat33 = vector(real), vector4(real), matrix(real)
 
@@ -271,7 +274,7 @@ def _touch(real: type) -> wp.Function:
         row: int,
         b: int,
     ):
-        return field(x, q, a, clock, row, b)[3] <= radius + q[a + 8]
+        return field(x, q, a, clock, row, b)[3] <= radius + q[a + 9]
 
     return touch
 
