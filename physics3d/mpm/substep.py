@@ -94,14 +94,16 @@ def _mark(real, hooks: tuple[Hook, ...]) -> wp.Kernel:
     ):
         p = wp.tid() + first
         x = rest[p] + u[p]
-        for h in range(wp.static(count)):
-            if wp.static(functions[h])(x, radius[p], q, wp.static(a[h]), clock, row[0], wp.static(b[h])):
-                corner = base(cell[p], offset[p] + u[p] / dx)
-                i, j, k = int(corner[0]) - window[0], int(corner[1]) - window[1], int(corner[2]) - window[2]
-                nx, ny, nz = window[3], window[4], window[5]
-                if i >= 0 and j >= 0 and k >= 0 and i <= nx - 3 and j <= ny - 3 and k <= nz - 3:
+        corner = base(cell[p], offset[p] + u[p] / dx)
+        ix, iy, iz = corner[0] - real(window[0]), corner[1] - real(window[1]), corner[2] - real(window[2])
+        nx, ny, nz = window[3], window[4], window[5]
+        zero = real(0.0)
+        inside = ix >= zero and iy >= zero and iz >= zero and ix <= real(nx - 3) and iy <= real(ny - 3)
+        if inside and iz <= real(nz - 3):
+            for h in range(wp.static(count)):
+                if wp.static(functions[h])(x, radius[p], q, wp.static(a[h]), clock, row[0], wp.static(b[h])):
                     for n in range(27):
-                        at = ((i + n / 9) * ny + j + (n / 3) % 3) * nz + k + n % 3
+                        at = ((int(ix) + n / 9) * ny + int(iy) + (n / 3) % 3) * nz + int(iz) + n % 3
                         touched[h, at] = stamp[0]
 
     return mark_kernel
@@ -152,6 +154,16 @@ def _mirror(real) -> tuple[wp.Function, wp.Function]:
     return flip, folded
 
 
+@wp.func
+def index(at: wp.vec3i, window: wp.array(dtype=int)):
+    """Number of a node in the window, -1 if it is not there."""
+    i, j, k = at[0] - window[0], at[1] - window[1], at[2] - window[2]
+    n = (i * window[4] + j) * window[5] + k
+    if i < 0 or j < 0 or k < 0 or i >= window[3] or j >= window[4] or k >= window[5]:
+        n = -1
+    return n
+
+
 @cache
 def _update(real, hooks: tuple[Hook, ...], touches: tuple[Hook, ...], mirrored: bool) -> wp.Kernel:
     vec3, vec4 = vector(real), vector4(real)
@@ -188,6 +200,7 @@ def _update(real, hooks: tuple[Hook, ...], touches: tuple[Hook, ...], mirrored: 
         i = n / (window[5] * window[4])
         at = wp.vec3i(window[0] + i, window[1] + j, window[2] + k)
         node = grid[n]
+        here = n
         sign = vec3(real(1.0), real(1.0), real(1.0))
         if wp.static(mirrored):
             near = 0
@@ -203,6 +216,8 @@ def _update(real, hooks: tuple[Hook, ...], touches: tuple[Hook, ...], mirrored: 
                     near = 1
             if near == 1:
                 node = folded(at, window, walls, grid)
+                # a mirror image obeys what its original does
+                here = index(at, window)
         m = node[3]
         v = vec3()
         if m > mass_floor:
@@ -211,11 +226,9 @@ def _update(real, hooks: tuple[Hook, ...], touches: tuple[Hook, ...], mirrored: 
             for h in range(wp.static(count)):
                 if wp.static(marks[h] < 0):
                     v = wp.static(functions[h])(x, v, q, wp.static(a[h]), clock, r, wp.static(b[h]))
-                else:
-                    i, j, k = at[0] - window[0], at[1] - window[1], at[2] - window[2]
-                    if i >= 0 and j >= 0 and k >= 0 and i < window[3] and j < window[4] and k < window[5]:
-                        if touched[wp.static(marks[h]), (i * window[4] + j) * window[5] + k] == stamp[0]:
-                            v = wp.static(functions[h])(x, v, q, wp.static(a[h]), clock, r, wp.static(b[h]))
+                elif here >= 0:
+                    if touched[wp.static(marks[h]), here] == stamp[0]:
+                        v = wp.static(functions[h])(x, v, q, wp.static(a[h]), clock, r, wp.static(b[h]))
         if wp.static(mirrored):
             v = wp.cw_mul(sign, v)
         node_velocity[n] = v
