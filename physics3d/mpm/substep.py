@@ -226,9 +226,9 @@ def _update(real, hooks: tuple[Hook, ...], touches: tuple[Hook, ...], mirrored: 
             for h in range(wp.static(count)):
                 if wp.static(marks[h] < 0):
                     v = wp.static(functions[h])(x, v, q, wp.static(a[h]), clock, r, wp.static(b[h]))
-                elif here >= 0:
-                    if touched[wp.static(marks[h]), here] == stamp[0]:
-                        v = wp.static(functions[h])(x, v, q, wp.static(a[h]), clock, r, wp.static(b[h]))
+                elif here >= 0 and touched[wp.static(marks[h]), wp.max(here, 0)] == stamp[0]:
+                    # both sides of this `and` are computed
+                    v = wp.static(functions[h])(x, v, q, wp.static(a[h]), clock, r, wp.static(b[h]))
         if wp.static(mirrored):
             v = wp.cw_mul(sign, v)
         node_velocity[n] = v

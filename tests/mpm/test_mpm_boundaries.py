@@ -398,7 +398,7 @@ def test_big_cube_is_a_half_space(kind, friction):
 
 
 def test_ball_stays_outside_a_ball():
-    """A ball of jelly falls on one that stands: particles a quarter of a cell thick on either side touch it, no more."""
+    """A ball of jelly falls on one that stands: particles half a cell thick touch it, no more."""
     mesh = open3d().geometry.TriangleMesh.create_sphere(0.3, resolution=20)
     ball = MeshCollider(
         vertices=torch.tensor(np.asarray(mesh.vertices)), triangles=torch.tensor(np.asarray(mesh.triangles)),
