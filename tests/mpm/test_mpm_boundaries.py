@@ -198,7 +198,7 @@ def test_column_comes_to_rest_with_its_lower_face_on_separating_ground(plane, sc
     )
     sag = 1000 * 9.81 * 0.4**2 / (2 * 1e5) / 0.05
     assert trajectory.health["speed_max"][-1] < 1e-3
-    # a fifth of the cells that nodes which act by themselves leave below it, or above it, depending on the plane
+    # a few per cent of strain over half a cell; nodes that act by themselves leave it 0.3 cells deep to 0.2 above
     assert abs(float(lower[-1])) < 0.1
     assert float(upper[-1]) == pytest.approx(8 - sag, abs=0.1)
 
