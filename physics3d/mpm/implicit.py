@@ -288,7 +288,9 @@ class ImplicitSubsteps:
         before, residual = math.inf, self._residual(v)
         size = self._norm(residual)
         while True:
-            goal = self.tolerance * (self._spread(free) + self._spread(v)) + self._noise(v)
+            # a body that falls from rest has no spread and, so far, no speed
+            rounding = self._noise(v) + self.rounding * self._norm(free)
+            goal = self.tolerance * (self._spread(free) + self._spread(v)) + rounding
             # within thirty of it, a residual that has stopped falling is rounding too
             if size <= goal or 0.5 * before <= size <= 30 * goal:
                 return Step(v, newton, products)
@@ -344,7 +346,10 @@ class ImplicitSubsteps:
         self.grid = wp.to_torch(sub.grid)[:, : self.count]
         self.nodes = wp.to_torch(sub.node_velocity)[: self.count]
         self.grid.zero_()
-        self._on_particles("push", "scatter")
+        if "mark" in sub.kernels:
+            for w in range(sub.workers):
+                sub._new_stamp(w)
+        self._on_particles("push", "scatter", "mark")
         self._sum(self.grid)
         self.base = self.grid[0].clone()
         self.momentum, m = self.base.split((3, 1), 1)
@@ -698,7 +703,7 @@ class ImplicitSubsteps:
             return launch(sub.kernels[kernel], *arguments[kernel], adjoints)
 
         real = self.real
-        if name in ("push", "gather", "steer", "advance"):
+        if name in ("push", "mark", "gather", "steer", "advance"):
             return launch(sub.kernels[name], *arguments[name]) if name in sub.kernels else None
         if name in ("update", "update_still"):
             return launch(sub.kernels["update"], *arguments["update"])

@@ -562,10 +562,11 @@ class _Solver:
         self.mass = self.setting.mass.to(position.device)[self.order].to(**kind)
         self.volume = self.mass / world.density
         real = _real(world.dtype)
-        pushes, nodes, steers, a, b = [], [], [], 0, 2
+        pushes, touches, nodes, steers, a, b = [], [], [], [], 0, 2
         for row, (boundary, width) in enumerate(zip(self.boundaries, self.widths)):
             for hooks, function in (
                 (pushes, boundary.acceleration(real)),
+                (touches, boundary.touch(real)),
                 (nodes, boundary.node(real)),
                 (steers, boundary.steer(real)),
             ):
@@ -592,6 +593,7 @@ class _Solver:
             signals=b - 2,
             pushes=tuple[Hook, ...](pushes),
             nodes=tuple[Hook, ...](nodes),
+            touches=tuple[Hook, ...](touches),
             steers=tuple[Hook, ...](steers),
             walls=mirror_nodes(self.boundaries, self.setting),
             material=world.material.advance(real),

@@ -2,6 +2,7 @@
 
     push     v_p += dt a_p                                        forces from outside (only if a boundary has some)
     scatter  particles -> momentum and mass of nodes
+    mark     the nodes of particles that touch a boundary         (only if a boundary acts on those alone)
     update   v_i = e^(-c dt) (p_i/m_i + dt g), then the boundaries
     gather   nodes -> v_p, L_p
     steer    imposed motion of particles                          (only if a boundary has some)
@@ -66,6 +67,49 @@ def _push(real, hooks: tuple[Hook, ...]) -> wp.Kernel:
 
 
 @cache
+def _mark(real, hooks: tuple[Hook, ...]) -> wp.Kernel:
+    """Kernel: for each boundary that acts on touched nodes alone, stamp the nodes of the particles that touch it."""
+    vec3 = vector(real)
+    base, _, _, _ = transfer.stencil(real)
+    count = len(hooks)
+    functions, a, b, _ = zip(*hooks)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def mark_kernel(
+        # in
+        first: int,
+        dx: real,
+        window: wp.array(dtype=int),
+        clock: wp.array2d(dtype=real),
+        row: wp.array(dtype=int),
+        stamp: wp.array(dtype=int),  # [1] another one in every substep, so that nothing need be cleared
+        rest: wp.array(dtype=vec3),  # [p] [m]
+        radius: wp.array(dtype=real),  # [p] [m]
+        cell: wp.array(dtype=wp.vec3i),
+        offset: wp.array(dtype=vec3),
+        q: wp.array(dtype=real),
+        u: wp.array(dtype=vec3),
+        # out
+        touched: wp.array2d(dtype=int),  # [hook, node] the stamp: whoever writes, writes the same
+    ):
+        p = wp.tid() + first
+        x = rest[p] + u[p]
+        corner = base(cell[p], offset[p] + u[p] / dx)
+        ix, iy, iz = corner[0] - real(window[0]), corner[1] - real(window[1]), corner[2] - real(window[2])
+        nx, ny, nz = window[3], window[4], window[5]
+        zero = real(0.0)
+        inside = ix >= zero and iy >= zero and iz >= zero and ix <= real(nx - 3) and iy <= real(ny - 3)
+        if inside and iz <= real(nz - 3):
+            for h in range(wp.static(count)):
+                if wp.static(functions[h])(x, radius[p], q, wp.static(a[h]), clock, row[0], wp.static(b[h])):
+                    for n in range(27):
+                        at = ((int(ix) + n / 9) * ny + int(iy) + (n / 3) % 3) * nz + int(iz) + n % 3
+                        touched[h, at] = stamp[0]
+
+    return mark_kernel
+
+
+@cache
 def _mirror(real) -> tuple[wp.Function, wp.Function]:
     """Warp functions of walls that mirror: walls[0:3] lower, walls[3:6] upper nodes, then 1 where one is sticky.
 
@@ -110,12 +154,25 @@ def _mirror(real) -> tuple[wp.Function, wp.Function]:
     return flip, folded
 
 
+@wp.func
+def index(at: wp.vec3i, window: wp.array(dtype=int)):
+    """Number of a node in the window, -1 if it is not there."""
+    i, j, k = at[0] - window[0], at[1] - window[1], at[2] - window[2]
+    n = (i * window[4] + j) * window[5] + k
+    if i < 0 or j < 0 or k < 0 or i >= window[3] or j >= window[4] or k >= window[5]:
+        n = -1
+    return n
+
+
 @cache
-def _update(real, hooks: tuple[Hook, ...], mirrored: bool) -> wp.Kernel:
+def _update(real, hooks: tuple[Hook, ...], touches: tuple[Hook, ...], mirrored: bool) -> wp.Kernel:
     vec3, vec4 = vector(real), vector4(real)
     flip, folded = _mirror(real)
     count = len(hooks)
-    functions, a, b, _ = zip(*hooks) if hooks else ((), (), (), ())
+    functions, a, b, rows = zip(*hooks) if hooks else ((), (), (), ())
+    # of the boundary of each hook, its place among those that act on touched nodes alone, or -1
+    mark_row = {row: place for place, (_, _, _, row) in enumerate(touches)}
+    marks = tuple(mark_row.get(row, -1) for row in rows)
 
     @wp.kernel(module="unique")
     def update_kernel(
@@ -129,6 +186,8 @@ def _update(real, hooks: tuple[Hook, ...], mirrored: bool) -> wp.Kernel:
         clock: wp.array2d(dtype=real),  # columns 0: dt [s], 1: exp(-damping dt)
         row: wp.array(dtype=int),
         walls: wp.array(dtype=int),
+        stamp: wp.array(dtype=int),
+        touched: wp.array2d(dtype=int),  # [hook, node]
         q: wp.array(dtype=real),
         grid: wp.array(dtype=vec4),
         # out
@@ -141,6 +200,7 @@ def _update(real, hooks: tuple[Hook, ...], mirrored: bool) -> wp.Kernel:
         i = n / (window[5] * window[4])
         at = wp.vec3i(window[0] + i, window[1] + j, window[2] + k)
         node = grid[n]
+        here = n
         sign = vec3(real(1.0), real(1.0), real(1.0))
         if wp.static(mirrored):
             near = 0
@@ -156,13 +216,19 @@ def _update(real, hooks: tuple[Hook, ...], mirrored: bool) -> wp.Kernel:
                     near = 1
             if near == 1:
                 node = folded(at, window, walls, grid)
+                # a mirror image obeys what its original does
+                here = index(at, window)
         m = node[3]
         v = vec3()
         if m > mass_floor:
             v = clock[r, 1] * (vec3(node[0], node[1], node[2]) / m + clock[r, 0] * gravity)
             x = origin + dx * vec3(real(at[0]), real(at[1]), real(at[2]))
             for h in range(wp.static(count)):
-                v = wp.static(functions[h])(x, v, q, wp.static(a[h]), clock, r, wp.static(b[h]))
+                if wp.static(marks[h] < 0):
+                    v = wp.static(functions[h])(x, v, q, wp.static(a[h]), clock, r, wp.static(b[h]))
+                elif here >= 0 and touched[wp.static(marks[h]), wp.max(here, 0)] == stamp[0]:
+                    # both sides of this `and` are computed
+                    v = wp.static(functions[h])(x, v, q, wp.static(a[h]), clock, r, wp.static(b[h]))
         if wp.static(mirrored):
             v = wp.cw_mul(sign, v)
         node_velocity[n] = v
@@ -279,6 +345,7 @@ class Substeps:
         signals: int,  # columns of the clock
         pushes: tuple[Hook, ...],
         nodes: tuple[Hook, ...],
+        touches: tuple[Hook, ...],  # of the boundaries whose nodes' hook acts on touched nodes alone
         steers: tuple[Hook, ...],
         walls: Sequence[int] | None,  # [12] of `_mirror`; None: no wall mirrors
         material: wp.Function,
@@ -296,12 +363,14 @@ class Substeps:
         self.fast = self.device.type == "cpu" if fast is None else fast
         self.kernels = {
             "scatter": transfer.scatter(self.real, self.fast),
-            "update": _update(self.real, nodes, walls is not None),
+            "update": _update(self.real, nodes, touches, walls is not None),
             "gather": transfer.gather(self.real, self.fast),
             "advance": _advance(self.real, material),
         }
         if self.fast:
             self.kernels["pass"] = particle_pass(self.real, material, pushes, steers)
+        if touches:
+            self.kernels["mark"] = _mark(self.real, touches)
         if pushes:
             self.kernels["push"] = _push(self.real, pushes)
         if steers:
@@ -317,7 +386,9 @@ class Substeps:
             "q": wp.from_torch(q) if len(q) else self._zeros(1, real),
             "selection": wp.from_torch(selection) if len(selection) else self._zeros((1, self.n), real),
             "coefficients": wp.from_torch(coefficients),
+            "radius": wp.from_torch(0.5 * volume ** (1 / 3)),
         }
+        self.touch_count = len(touches)
         self.mirrored = walls is not None
         self.walls = self._zeros(12, wp.int32)
         if walls is not None:
@@ -331,6 +402,9 @@ class Substeps:
         self.ranges = [(int(a), int(b - a)) for a, b in pairwise(edges)]
         self.row = [self._zeros(1, wp.int32) for _ in self.ranges]
         self.row_numpy = [row.numpy() for row in self.row] if self.device.type == "cpu" else []
+        self.stamp = [self._zeros(1, wp.int32) for _ in self.ranges]
+        self.stamp_numpy = [stamp.numpy() for stamp in self.stamp] if self.device.type == "cpu" else []
+        self.last_stamp = [0 for _ in self.ranges]
         self.lost = [self._zeros(1, wp.int32) for _ in self.ranges]
         self.states: list[State] = []
         self.adjoint: dict | None = None
@@ -354,6 +428,7 @@ class Substeps:
             self.capacity = int(1.5 * self.node_count) + 1  # one more: see `columns`
             self.grid = self._zeros((self.workers, self.capacity), vector4(self.real))
             self.node_velocity = self._zeros(self.capacity, vector(self.real))
+            self.touched = self._zeros((self.touch_count, self.capacity) if self.touch_count else (1, 1), wp.int32)
             if self.adjoint is not None:
                 self._make_adjoint_grid()
             self._drop_launches()
@@ -374,6 +449,7 @@ class Substeps:
             for s, launch in enumerate(launches[w]):
                 self._set_row(w, s)
                 self._scatter_phase(launch)
+                self._mark_phase(w, launch)
                 wait()
                 self._update_phase(launch, *dims[w], wait)
                 wait()
@@ -391,6 +467,7 @@ class Substeps:
             self._scatter_phase(launches[w][0])
             for s, launch in enumerate(launches[w]):
                 self._set_row(w, s)
+                self._mark_phase(w, launch)
                 wait()
                 self._update_phase(launch, *dims[w], wait, momenta[s] if keep else None)
                 wait()
@@ -464,6 +541,7 @@ class Substeps:
                     self._scatter_phase(launch)
                 elif "push" in launch:
                     launch["push"].launch()
+                self._mark_phase(w, launch)
                 self._span(adjoint["clear_private"], 0, self.node_count)
                 wait()
                 if momenta is None:
@@ -528,9 +606,14 @@ class Substeps:
         clock = [self.clock, self.row[w]]
         hooked = [first, *clock, c["selection"], c["rest"], c["q"], a["u"]]
         place = [c["cell"], c["offset"], a["u"]]
-        onto = [self.walls, c["q"], self.grid[0]]
+        onto = [self.walls, self.stamp[w], self.touched, c["q"], self.grid[0]]
         return {
             "push": ([*hooked, a["v"]], [self.v_pushed]),
+            "mark": (
+                [first, self.dx, self.window, *clock, self.stamp[w], c["rest"], c["radius"], c["cell"], c["offset"],
+                 c["q"], a["u"]],
+                [self.touched],
+            ),
             "scatter": (
                 [first, self.dx, self.window, *clock, c["mass"], c["volume"], *place, v, a["L"], a["tau"]],
                 [self.grid[w], self.lost[w]],
@@ -578,7 +661,7 @@ class Substeps:
             hooked = [None, None, None, None, adjoint["rest"], q, a["u"]]
             adjoints = {
                 "push": ([*hooked, a["v"]], [adjoint["v_pushed"]]),
-                "update": ([*[None] * 9, q, self.adjoint_grid], [self.adjoint_node_velocity[0]]),
+                "update": ([*[None] * 11, q, self.adjoint_grid], [self.adjoint_node_velocity[0]]),
                 "steer": ([*hooked, b["v_gathered"], b["L_gathered"]], [b["v"], b["L"]]),
                 "advance": (
                     [None] * 3 + [a["u"], b["v"], b["L"], a["H"], adjoint["coefficients"], a["memory"]],
@@ -637,6 +720,12 @@ class Substeps:
             launch["push"].launch()
         self._span(launch["clear"], 0, self.node_count)
         launch["scatter"].launch()
+
+    def _mark_phase(self, w: int, launch: dict[str, wp.Launch]) -> None:
+        """Stamp what the particles touch at the start of the substep; after all have read the last stamps."""
+        if "mark" in launch:
+            self._new_stamp(w)
+            launch["mark"].launch()
 
     def _update_phase(
         self,
@@ -732,6 +821,14 @@ class Substeps:
         table = np.zeros(self.clock.shape)
         table[: len(clock)] = clock
         self.clock.assign(table)
+
+    def _new_stamp(self, w: int) -> None:
+        """The same on every thread, for all take the same steps."""
+        self.last_stamp[w] += 1
+        if self.device.type == "cpu":
+            self.stamp_numpy[w][0] = self.last_stamp[w]
+        else:
+            self.stamp[w].fill_(self.last_stamp[w])
 
     def _set_row(self, w: int, s: int) -> None:
         if self.device.type == "cpu":

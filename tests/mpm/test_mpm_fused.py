@@ -51,6 +51,7 @@ def substeps(material, *, fast: bool, moved: bool = False, threads: int = 1) -> 
         signals=sum(len(s) for s in signals),
         pushes=((push.acceleration(real), 0, 2, 0),) if moved else (),
         nodes=(),
+        touches=(),
         steers=((turn.steer(real), len(q[0]), 2 + len(signals[0]), 1),) if moved else (),
         walls=None,
         material=material.advance(real),

@@ -1,6 +1,7 @@
-"""What a boundary condition is to the solver: numbers, and up to three Warp functions, each at its place in a substep.
+"""What a boundary condition is to the solver: numbers, and up to four Warp functions, each at its place in a substep.
 
     acceleration   added to selected particles before they are scattered           (forces from outside)
+    touch          does a particle reach the boundary? `node` then acts only on the nodes of those that do
     node           velocity of a grid node -> velocity of that node                 (walls, colliders, held regions)
     steer          velocity and its gradient of selected particles after the gather  (motion imposed on the body itself)
 
@@ -20,6 +21,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 Vector = tuple[float, float, float]
+NEAREST = 0.499  # cells: how far in front of a surface the nodes still stand for it that touching particles have
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,10 +51,12 @@ class AbstractBoundary(abc.ABC):
 
     The Warp functions of a boundary (memoised by their arguments, so that equal boundaries share one) are
         node(x: vec3, v: vec3, q: array[real], a: int, clock: array2d[real], row: int, b: int) -> vec3
+        touch(x: vec3, radius: real, q, a, clock, row, b) -> bool
         acceleration(weight: real, x: vec3, q, a, clock, row, b) -> vec3
         steer(weight: real, x: vec3, v: vec3, L: mat33, q, a, clock, row, b) -> (vec3, mat33)
     where q[a + i] is its i-th parameter, clock[row, b + i] its i-th signal in this substep, clock[row, 0] is dt, x is
-    in metres, and weight what `selection` gave for the particle (never 0 in a call).
+    in metres, weight what `selection` gave for the particle (never 0 in a call), and radius half the edge of the cube
+    that the particle is at rest [m].
     """
 
     @abc.abstractmethod
@@ -76,6 +80,9 @@ class AbstractBoundary(abc.ABC):
         return ()
 
     def node(self, real: type) -> wp.Function | None:
+        return None
+
+    def touch(self, real: type) -> wp.Function | None:
         return None
 
     def acceleration(self, real: type) -> wp.Function | None:

@@ -6,7 +6,13 @@ For nodes behind the plane, n . (x - point) <= 0, with v_n = v . n and v_t = v -
     separate   the same where v_n < 0, else v unchanged
     friction(v_t, j) = v_t max(0, 1 - mu j/|v_t|)
 Ground that sticks, or slips without friction, across an axis and on nodes of the grid mirrors (`mirror_nodes`).
-Source: Stomakhin et al. (2013) A material point method for snow simulation, sec. 8.
+
+A node has momentum of particles up to 1.5 dx away, so these rules alone stop a body a cell before it arrives. Ground
+that separates therefore acts only on nodes of particles that touch it, n . (x_p - point) <= V_p^(1/3)/2, and then up to
+dx/2 in front of the plane too, so that some layer of nodes is near it wherever it lies. Ground of the other kinds holds
+what is on it from the start; what falls on it is caught a cell early.
+Source: Stomakhin et al. (2013) A material point method for snow simulation, sec. 8; contact by the distance of the
+particles, not by the velocity of the nodes alone: Nairn et al. (2020) New material point method contact algorithms.
 """
 
 import functools
@@ -39,10 +45,11 @@ class HalfSpace(base.AbstractBoundary):
         base.require(sum(n * n for n in self.normal) > 0, self, "normal", "a vector that is not zero")
         base.require(self.friction >= 0, self, "friction", "a coefficient >= 0")
 
-    def parameters(self, setting: base.Setting) -> Float[Tensor, "8"]:
+    def parameters(self, setting: base.Setting) -> Float[Tensor, "9"]:
         normal = torch.tensor(self.normal, dtype=torch.float64)
-        # a node on the plane belongs to the ground whatever the rounding
-        rest = [self.friction, 1e-3 * setting.dx]
+        # what is on the plane belongs to the ground whatever the rounding
+        slack = 1e-3 * setting.dx
+        rest = [self.friction, base.NEAREST * setting.dx if self.kind == "separate" else slack, slack]
         return torch.cat(
             [
                 torch.tensor(self.point, dtype=torch.float64),
@@ -63,6 +70,9 @@ class HalfSpace(base.AbstractBoundary):
     def node(self, real: type) -> wp.Function:
         return _node(real, self.kind)
 
+    def touch(self, real: type) -> wp.Function | None:
+        return _touch(real) if self.kind == "separate" else None
+
 
 @functools.cache
 def coulomb(real: type) -> wp.Function:
@@ -80,6 +90,26 @@ def coulomb(real: type) -> wp.Function:
         return result
 
     return friction
+
+
+@functools.cache
+def _touch(real: type) -> wp.Function:
+    vec3 = vector(real)
+
+    @wp.func(name=f"half_space_touch_{real.__name__}")
+    def touch(
+        x: vec3,
+        radius: real,
+        q: wp.array(dtype=real),
+        a: int,
+        clock: wp.array2d(dtype=real),
+        row: int,
+        b: int,
+    ):
+        n = vec3(q[a + 3], q[a + 4], q[a + 5])
+        return wp.dot(n, x - vec3(q[a], q[a + 1], q[a + 2])) <= radius + q[a + 8]
+
+    return touch
 
 
 @functools.cache

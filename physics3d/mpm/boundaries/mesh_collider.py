@@ -8,8 +8,8 @@ after that it stands still:
     v_c(x) = (p(t + dt) - p(t))/dt + (R(t + dt) R(t)^T - I)/dt (x - p(t))
 
 so that what moves along with it keeps its shape, whatever dt. Nodes in the mesh, phi(y) <= 0, obey the rules of
-`half_space` with the normal n = grad phi/|grad phi| and the velocity v - v_c. Where phi has no gradient (a middle
-surface) they stick.
+`half_space` with the normal n = grad phi/|grad phi| and the velocity v - v_c, and where these ask whether a particle
+touches, it does with phi <= V_p^(1/3)/2. Where phi has no gradient (a middle surface) nodes stick.
 
 The signed distance phi is sampled once, with half the grid spacing, by Open3D, and interpolated trilinearly; it rides
 in `parameters`, the pose in `signals`. What is thinner than two cells may let material through. In a scene:
@@ -38,12 +38,12 @@ from torch import Tensor
 
 from physics3d.mpm.boundaries import base
 from physics3d.mpm.boundaries.half_space import KINDS, coulomb
-from physics3d.mpm.transfer import matrix, vector
+from physics3d.mpm.transfer import matrix, vector, vector4
 from physics3d.open3d_import import open3d
 
 SUFFIXES = (".obj", ".ply", ".stl")
 MOST_SAMPLES = 2**22
-HEAD = 9  # parameters before the samples
+HEAD = 10  # parameters before the samples
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +81,8 @@ class MeshCollider(base.AbstractBoundary):
         base.require_window(self)
 
     def parameters(self, setting: base.Setting) -> Float[Tensor, " k"]:
-        """Corner of the samples (3) [m], 1/h [1/m], samples along each axis (3), friction, slack [m], then phi [m]."""
+        """Corner of the samples (3) [m], 1/h [1/m], samples along each axis (3), friction, the largest phi of a node of
+        the mesh and what is forgiven a particle [m]; then phi [m]."""
         vertices, triangles = self._mesh()
         placed = self.scale * vertices @ _turn(np.array(self.rotation)).T
         spacing = setting.dx / 2
@@ -92,19 +93,21 @@ class MeshCollider(base.AbstractBoundary):
             upper = np.minimum(upper, np.array(setting.upper) - self.position + 4 * setting.dx)
             if (lower > upper).any():
                 raise ValueError(f"{self._name()} is outside the region {setting.lower} .. {setting.upper} m; move it")
-        count = np.ceil((upper - lower) / spacing).astype(int) + 3
+        count = np.ceil((upper - lower) / spacing).astype(int) + 5
         if math.prod(count.tolist()) > MOST_SAMPLES:
             across = " x ".join(map(str, count))
             raise ValueError(
                 f"{self._name()} needs {across} samples of its distance, {spacing:g} m apart; take a smaller mesh, "
                 "a smaller scale or a larger world.dx (or, if it stands still, a smaller region)"
             )
-        corner = lower - spacing
+        corner = lower - 2 * spacing  # a particle touches from half its edge away
         samples = _distance(
             placed.tobytes(), triangles.tobytes(), tuple(corner.tolist()), tuple(count.tolist()), spacing
         )
-        # a node on the surface belongs to the mesh whatever the rounding
-        head = [*corner, 1 / spacing, *count, self.friction, 1e-3 * setting.dx]
+        # what is on the surface belongs to the mesh whatever the rounding
+        slack = 1e-3 * setting.dx
+        reach = base.NEAREST * setting.dx if self.kind == "separate" else slack
+        head = [*corner, 1 / spacing, *count, self.friction, reach, slack]
         return torch.cat([torch.tensor(head, dtype=torch.float64), samples.to(torch.float64)])
 
     def signals(self, t: float, dt: float) -> tuple[float, ...]:
@@ -123,6 +126,9 @@ class MeshCollider(base.AbstractBoundary):
 
     def node(self, real: type) -> wp.Function:
         return _node(real, self.kind)
+
+    def touch(self, real: type) -> wp.Function | None:
+        return _touch(real) if self.kind == "separate" else None
 
     def _name(self) -> str:
         return f"MeshCollider {self.path or 'of vertices and triangles'}"
@@ -204,10 +210,10 @@ def _turn(w: np.ndarray) -> np.ndarray:
 
 
 @functools.cache
-def _node(real: type, kind: str) -> wp.Function:
-    vec3, mat33 = vector(real), matrix(real)
-    friction = coulomb(real)
-    sticky, separate = kind == "sticky", kind == "separate"
+def _field(real: type) -> tuple[wp.Function, wp.Function]:
+    """Warp functions matrix_at(clock, row, b), and field(x, q, a, clock, row, b): the gradient of phi and phi [m] at x;
+    (0, 0, 0) and infinity away from the samples."""
+    vec3, vec4, mat33 = vector(real), vector4(real), matrix(real)
 
     @wp.func
     def lookup(i: int, j: int, k: int, q: wp.array(dtype=real), a: int):
@@ -225,17 +231,9 @@ def _node(real: type, kind: str) -> wp.Function:
             clock[row, b + 6], clock[row, b + 7], clock[row, b + 8],
         )  # fmt: skip
 
-    @wp.func(name=f"mesh_collider_{kind}_{real.__name__}")
-    def node(
-        x: vec3,
-        v: vec3,
-        q: wp.array(dtype=real),
-        a: int,
-        clock: wp.array2d(dtype=real),
-        row: int,
-        b: int,
-    ):
-        result = v
+    @wp.func
+    def field(x: vec3, q: wp.array(dtype=real), a: int, clock: wp.array2d(dtype=real), row: int, b: int):
+        found = vec4(real(0.0), real(0.0), real(0.0), real(wp.inf))
         r = x - vec3(clock[row, b], clock[row, b + 1], clock[row, b + 2])
         R = matrix_at(clock, row, b + 3)
         c = q[a + 3] * (wp.transpose(R) * r - vec3(q[a], q[a + 1], q[a + 2]))  # place among the samples
@@ -253,20 +251,67 @@ def _node(real: type, kind: str) -> wp.Function:
             y0, y1 = blend(s[2], z00, z01), blend(s[2], z10, z11)
             u0, u1 = blend(s[2], w00, w01), blend(s[2], w10, w11)
             x0, x1 = blend(s[1], y0, y1), blend(s[1], u0, u1)
-            if blend(s[0], x0, x1) <= q[a + 8]:
-                along_z = blend(s[0], blend(s[1], z01 - z00, z11 - z10), blend(s[1], w01 - w00, w11 - w10))
-                slope = q[a + 3] * vec3(x1 - x0, blend(s[0], y1 - y0, u1 - u0), along_z)
-                carried = vec3(clock[row, b + 12], clock[row, b + 13], clock[row, b + 14])
-                carried = carried + matrix_at(clock, row, b + 15) * r
-                result = carried
-                steep = wp.length(slope)
-                if wp.static(not sticky) and steep > real(0.1):
-                    n = R * (slope / steep)
-                    relative = v - carried
-                    vn = wp.dot(n, relative)
-                    result = carried + friction(relative - vn * n, wp.abs(vn), q[a + 7])
-                    if wp.static(separate) and vn >= real(0.0):
-                        result = v
+            along_z = blend(s[0], blend(s[1], z01 - z00, z11 - z10), blend(s[1], w01 - w00, w11 - w10))
+            slope = R * (q[a + 3] * vec3(x1 - x0, blend(s[0], y1 - y0, u1 - u0), along_z))
+            found = vec4(slope[0], slope[1], slope[2], blend(s[0], x0, x1))
+        return found
+
+    return matrix_at, field
+
+
+@functools.cache
+def _touch(real: type) -> wp.Function:
+    vec3 = vector(real)
+    _, field = _field(real)
+
+    @wp.func(name=f"mesh_collider_touch_{real.__name__}")
+    def touch(
+        x: vec3,
+        radius: real,
+        q: wp.array(dtype=real),
+        a: int,
+        clock: wp.array2d(dtype=real),
+        row: int,
+        b: int,
+    ):
+        return field(x, q, a, clock, row, b)[3] <= radius + q[a + 9]
+
+    return touch
+
+
+@functools.cache
+def _node(real: type, kind: str) -> wp.Function:
+    vec3 = vector(real)
+    friction = coulomb(real)
+    matrix_at, field = _field(real)
+    sticky, separate = kind == "sticky", kind == "separate"
+
+    @wp.func(name=f"mesh_collider_{kind}_{real.__name__}")
+    def node(
+        x: vec3,
+        v: vec3,
+        q: wp.array(dtype=real),
+        a: int,
+        clock: wp.array2d(dtype=real),
+        row: int,
+        b: int,
+    ):
+        result = v
+        found = field(x, q, a, clock, row, b)
+        if found[3] <= q[a + 8]:
+            carried = vec3(clock[row, b + 12], clock[row, b + 13], clock[row, b + 14])
+            r = x - vec3(clock[row, b], clock[row, b + 1], clock[row, b + 2])
+            carried = carried + matrix_at(clock, row, b + 15) * r
+            result = carried
+            slope = vec3(found[0], found[1], found[2])
+            steep = wp.length(slope)
+            if wp.static(not sticky) and steep > real(0.1):
+                n = slope / steep
+                relative = v - carried
+                vn = wp.dot(n, relative)
+                result = carried + friction(relative - vn * n, wp.abs(vn), q[a + 7])
+                if wp.static(separate) and vn >= real(0.0):
+                    result = v
         return result
 
     return node
