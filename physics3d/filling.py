@@ -6,6 +6,7 @@ A reconstruction puts Gaussians on the visible surface only; a simulated body ne
     normals    least axis of the local covariance; outward is the side from which more of the sky is seen (what the body
                stands on or leans against hides the sky)
     thin       both sides see the sky alike (a petal, a leaf); such samples bound no volume
+    surface    where the photographs' cameras see it (`seen.py`), and not below what the body stands on
     inside     of the closed surface through the remaining samples (`Poisson`), or by `WindingNumber`
     particles  one per lattice cell of that volume, at the centroid of the part inside, V_p = its measure [m^3];
                plus one per spacing^2 of thin surface that no cell covers, V_p = area * thickness
@@ -244,7 +245,8 @@ def fill(
     are embedded; `interior` False leaves a shell; `sheet_thickness` [m] of thin parts, None takes sqrt(12) times the
     median least deviation of their Gaussians; isolated pieces with less than the share `drop_pieces_below` of the
     volume are dropped, of the others becomes what
-    `isolated` says, see `join_pieces`; `attach` marks the particles beside static Gaussians.
+    `isolated` says, see `join_pieces`; `attach` marks the particles beside static Gaussians. `cameras` of the
+    photographs say where the surface is (`seen.py`); with none it is a deviation outside the Gaussians' centres.
     Raises ValueError if nothing moves, or the lattice would be too large.
     """
     if not spacing > 0:
