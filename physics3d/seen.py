@@ -8,9 +8,9 @@ is its pictures. A camera tells of a point x at depth z, with the pixel it falls
     depth      d - z where m >= 1/2 and z < d + t: in front of what is seen there, or just behind it; d is the depth of
                the Gaussian at which half the light is gone, less its deviation along the ray
 
-Outlines exclude: the distance is the second largest of all cameras, so that one mistaken mask carves nothing. Depths
-are uncertain: the distance is their mean, cut off at the truncation t (Curless and Levoy 1996). The larger of the two
-holds. What no camera sees keeps -t.
+Outlines exclude: the distance is the largest but for a tenth of the cameras, so that a few mistaken masks carve
+nothing. Depths are uncertain: the distance is their mean, cut off at the truncation t (Curless and Levoy 1996). The
+larger of the two holds. What no camera sees keeps -t.
 
 What the body stands on or leans against bounds it where no camera looks: `ground` is the same surface of the static
 Gaussians around it, closed under the body by Poisson reconstruction.
@@ -95,9 +95,9 @@ def seen(
     covariance, moves = gaussians.covariance(), (label > 0).to(gaussians.mean)
     shown = moves[:, None].expand(-1, 3)
     precision = torch.linalg.inv(covariance.double() + 1e-10 * torch.eye(3, dtype=torch.float64))
-    outline, second = torch.full((len(x),), -t), torch.full((len(x),), -t)
-    total, looks = torch.zeros(len(x)), torch.zeros(len(x))
     which = np.unique(np.linspace(0, len(cameras) - 1, min(MOST_VIEWS, len(cameras))).round().astype(int))
+    outline = torch.full((max(2, len(which) // 10), len(x)), -t)  # the largest
+    total, looks = torch.zeros(len(x)), torch.zeros(len(x))
     for camera in log.progress([cameras[i] for i in which], "looking at the body"):
         camera = _as_fine_as(spacing / 3, camera, x)
         with torch.no_grad():
@@ -118,8 +118,7 @@ def seen(
         d, hidden = _read(shown_at, pixel, "nearest"), _read(hidden_at, pixel, "nearest")
         past = ((0.5 - share) * EDGE / camera.fx * z).clamp(-t, t)
         past = torch.where(within & ((share >= 0.5) | (z < hidden - t)), past, -t)
-        second = torch.maximum(second, torch.minimum(outline, past))
-        outline = torch.maximum(outline, past)
+        outline = torch.cat([outline, past[None]]).topk(len(outline), dim=0).values
         near = within & (z < d + t)
         total += torch.where(near, (d - z).clamp(max=t), 0)
         looks += near
@@ -130,8 +129,8 @@ def seen(
     return Seen(
         lower=lower,
         h=h,
-        distance=smooth(torch.maximum(distance, second)),
-        outline=smooth(second),
+        distance=smooth(torch.maximum(distance, outline[-1])),
+        outline=smooth(outline[-1]),
         unseen=lattice(unseen),
         truncation=t,
     )
