@@ -2,9 +2,9 @@
 
     A_k = sum over views and pixels of label k of t (blending weight of the Gaussian),   label = argmax_k A_k
 
-which minimises sum t |rendered label - mask| in closed form, because rendering is linear in the labels (Shen et al. 2024,
-"FlashSplat", with t = 1). Here t is small next to outlines, across which Gaussians show: else the rim of a body, and what
-barely shows beside it, would take the wrong side. A Gaussian that shows nowhere takes the label of its neighbours.
+which minimises sum t |rendered label - mask| in closed form, because rendering is linear in the labels (Shen et al.
+2024, "FlashSplat", with t = 1). Here t is small next to outlines, across which Gaussians show: else the rim of a body,
+and what barely shows beside it, would take the wrong side. A Gaussian that shows nowhere takes its neighbours' label.
 """
 
 from collections.abc import Sequence
@@ -29,7 +29,7 @@ UNSURE = 0.1  # what a pixel counts there: enough for what is too thin to show e
 def contributions(
     gaussians: Gaussians, cameras: Sequence[Camera], maps: Sequence[Int[Tensor, "h w"]], count: int
 ) -> Float[Tensor, "n count"]:
-    """A [n, count] [px] for labels 0..count - 1, given a map of labels for every camera; each pixel counts its `trust`."""
+    """A [n, count] [px] for labels 0..count - 1, given a map of labels for every camera; pixels count by `trust`."""
     total = torch.zeros(len(gaussians), count)
     labels = torch.arange(count)[:, None, None]
     for camera, labelled in zip(cameras, maps, strict=True):

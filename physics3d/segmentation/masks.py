@@ -58,7 +58,7 @@ class AbstractVideoMasker(AbstractMasker):
 
 @dataclass(frozen=True, kw_only=True)
 class GrabCut(AbstractMasker):
-    """Colour models of object and surroundings, separated by a minimum cut: OpenCV's, or `outline` where views agree."""
+    """Colour models of object and surroundings, separated by a minimum cut: OpenCV's, or near a guess our `outline`."""
 
     iterations: int = 5
     most_points: int = 400

@@ -1,16 +1,17 @@
 """A blunt guess and the photograph -> the pixels of the object: GrabCut's energy, to which the guess belongs.
 
-    E(x) = - sum_p x_p (prior + colour + halves)_p + sum_pq SMOOTH/|p - q| exp(-|c_p - c_q|^2 / 2 <|c_p - c_q|^2>) [x_p != x_q]
+    E(x) = - sum_p x_p (prior + colour + halves)_p + sum_pq x_p (1 - x_q) g/|p - q| exp(-|c_p - c_q|^2 / (2 m))
 
-over x_p = 1 on the object, 0 beside it; p, q are neighbours in the grid of 8, c is Lab colour. All three are logarithms of
-odds: `prior` = ln s/(1 - s) of the guessed share s, `colour` compares how often either side shows this colour in this region
-of the picture, and `halves` which of the two colours that meet at the outline the pixel is nearer to, so that one of mixed
-colour is the object's if it covers half of it. GrabCut (Rother et al. 2004) has the second alone, with colours of the whole
-picture, and loses what the guess knew wherever colours are alike. The minimum is exact (Boykov and Jolly 2001).
+over x_p = 1 on the object and 0 beside it; q are the eight neighbours of p, c is Lab colour, m the mean of the squares,
+g = SMOOTH. The three are logarithms of odds: `prior` = ln s/(1 - s) of the guessed share s, `colour` compares how often
+either side shows this colour in this region of the picture, and `halves` which of the colours that meet at the outline
+is nearer, so that a pixel of mixed colour is the object's if half of it is covered. GrabCut (Rother et al. 2004) has
+the second alone, with colours of the whole picture, and loses what the guess knew wherever colours are alike. The
+minimum is exact (Boykov and Jolly 2001).
 """
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 WRONG = 0.02  # share of pixels far from the outline at which the guess may be wrong
 COLOUR = 6.0  # colours closer than this are alike [Lab units]
@@ -69,7 +70,8 @@ def away_from_outline(mask: Bool[np.ndarray, "h w"]) -> tuple[Bool[np.ndarray, "
     """The pixels inside and those outside whose neighbours all are there too."""
     from scipy import ndimage
 
-    return tuple(ndimage.binary_erosion(side, np.ones((3, 3)), border_value=1) for side in (mask, ~mask))
+    inner, outer = (ndimage.binary_erosion(side, np.ones((3, 3)), border_value=1) for side in (mask, ~mask))
+    return inner, outer
 
 
 def nearer_half(
@@ -96,7 +98,9 @@ def nearer_half(
     return np.where(known, np.clip(odds, -SMOOTH, SMOOTH), 0.0)
 
 
-def price_of_parting(colour: Float[np.ndarray, "h w 3"]):
+def price_of_parting(
+    colour: Float[np.ndarray, "h w 3"],
+) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
     """Neighbours (index, index) in the grid of 8, and what an outline between them costs: less where colours change."""
     height, width = colour.shape[:2]
     index, flat, pairs, length = np.arange(height * width).reshape(height, width), colour.reshape(-1, 3), [], []
@@ -109,7 +113,12 @@ def price_of_parting(colour: Float[np.ndarray, "h w 3"]):
     return p, q, SMOOTH / away * np.exp(-contrast / max(2 * float(contrast.mean()), 1e-9))
 
 
-def minimum_cut(evidence: Float[np.ndarray, "h w"], p, q, price: Float[np.ndarray, " m"]) -> Bool[np.ndarray, "h w"]:
+def minimum_cut(
+    evidence: Float[np.ndarray, "h w"],
+    p: Int[np.ndarray, " m"],
+    q: Int[np.ndarray, " m"],
+    price: Float[np.ndarray, " m"],
+) -> Bool[np.ndarray, "h w"]:
     """x that minimises - sum x evidence + sum price [x_p != x_q]: what the source of a maximal flow still reaches."""
     from scipy import sparse
     from scipy.sparse.csgraph import breadth_first_order, maximum_flow

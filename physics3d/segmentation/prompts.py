@@ -1,10 +1,10 @@
 """What a person says about one photograph, carried to the others through the Gaussians.
 
-The mask of the prompted photograph labels the Gaussians that it shows (see `lift`); those that it hides or barely shows
-may be the object's where there is room. Drawn from the next camera this says of every pixel which share is the object's, and the
-masker finds the outline near there. Views are taken in the order of their angle to the prompted one, and each adds what
-it shows, so that the far side is reached step by step. What is farther behind the prompted view's surface than the
-object is wide is never part of it: prompt a view that shows it large.
+The mask of the prompted photograph labels the Gaussians that it shows (see `lift`); those that it hides or barely
+shows may be the object's where there is room. Drawn from the next camera this says of every pixel which share is the
+object's, and the masker finds the outline near there. Views are taken in the order of their angle to the prompted one,
+and each adds what it shows, so that the far side is reached step by step. What is farther behind the prompted view's
+surface than the object is wide is never part of it: prompt a view that shows it large.
 """
 
 from dataclasses import dataclass

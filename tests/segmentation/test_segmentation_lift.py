@@ -68,7 +68,7 @@ def test_hidden_gaussians_take_the_label_of_their_neighbours(scene):
     core, _ = sphere(50, 0.03, rng)
     core[:, 2] = np.abs(core[:, 2])  # below, the nearest Gaussians that show are those of the table
     hidden = discs(core - np.array([0.06, 0, 0]), core / 0.03, rng, sigma=0.0005)
-    both = joined(gaussians, replace(hidden, opacity=0.1 * hidden.opacity))
+    both = joined(gaussians, replace(hidden, opacity_logit=hidden.opacity_logit - 5))
     maps = [true_map(gaussians, truth, c) for c in CAMERAS]
     weights = contributions(both, CAMERAS, maps, 3)
     assert float(weights[-50:].sum(1).max()) < NEGLIGIBLE
@@ -99,7 +99,7 @@ def test_the_rim_of_a_body_has_its_label(scene):
     # masks of 64 px: a ball is 16 wide
     cameras = [c.scaled(0.4) for c in CAMERAS]
     label = lift(gaussians.mean, contributions(gaussians, cameras, [true_map(gaussians, truth, c) for c in cameras], 3))
-    # of two thousand Gaussians a few that show next to nowhere may be wrong; were all pixels to count the same, it were 0.988
+    # some that show next to nowhere may be wrong; were all pixels to count the same, it would be 0.988
     for k in (1, 2):
         assert weighted_overlap((label == k) & seen, (truth == k) & seen, opacity) > 0.99
 
