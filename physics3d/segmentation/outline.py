@@ -16,7 +16,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 WRONG = 0.02  # share of pixels far from the outline at which the guess may be wrong
 COLOUR = 6.0  # colours closer than this are alike [Lab units]
 REGIONS = 3  # along each side of the picture, with colours of their own
-FEW = 30.0  # pixels of a side in a region, fewer of which say little of its colours
+FAINT = 0.2  # weight of colours alike only within three times that
+FEW = 15.0  # pixels of a side in a region, fewer of which say little of its colours
 COLOURS = 500.0  # that a side may have
 SMOOTH = 4.0  # price of a pixel's length of outline where nothing shows
 MEET = 1.0  # reach of the colours that meet at the outline [px]
@@ -46,9 +47,13 @@ def likelier(
 ) -> Float[np.ndarray, "h w"]:
     """ln p(colour | object) / p(colour | beside it), from pixels that count `on` for the one and `off` for the other.
 
-    Histograms by region, smoothed over colours and regions; a side that a region hardly shows has any colour there.
+    Histograms by region, spread over like colours and regions; where a region hardly shows a side, both may have any.
     """
     from scipy import ndimage
+
+    def spread(count, shades, regions):
+        modes = ["constant"] * 3 + ["nearest"] * 2
+        return ndimage.gaussian_filter(count, (shades,) * 3 + (regions,) * 2, mode=modes, truncate=2.5)
 
     height, width = on.shape
     rows, columns = np.indices(on.shape)
@@ -56,14 +61,15 @@ def likelier(
     cell = np.stack([*np.moveaxis(shade, 2, 0), rows * REGIONS // height, columns * REGIONS // width]).reshape(5, -1)
     shape = tuple(cell.max(1) + 1)
     place = np.ravel_multi_index(tuple(cell), shape)
-    logarithm = []
+    sides = []
     for weight in (on, off):
         count = np.bincount(place, weights=weight.reshape(-1), minlength=int(np.prod(shape))).reshape(shape)
-        modes = ["constant"] * 3 + ["nearest"] * 2
-        count = ndimage.gaussian_filter(count, (1, 1, 1, 0.7, 0.7), mode=modes, truncate=2.5)
-        often = (count + FEW / COLOURS) / (count.sum((0, 1, 2), keepdims=True) + FEW)
-        logarithm.append(np.log(often.reshape(-1)[place]))
-    return (logarithm[0] - logarithm[1]).reshape(on.shape)
+        count = spread(count, 1.0, 0.7)
+        sides.append(count + FAINT * spread(count, 3.0, 0.0))
+    shown = [side.sum((0, 1, 2), keepdims=True) for side in sides]
+    novel = FEW / (np.minimum(*shown) + FEW)  # alike, so that a colour that neither side has shown says nothing
+    often = [(1 - novel) * side / np.maximum(n, 1e-9) + novel / COLOURS for side, n in zip(sides, shown)]
+    return np.log(often[0] / often[1]).reshape(-1)[place].reshape(on.shape)
 
 
 def away_from_outline(mask: Bool[np.ndarray, "h w"]) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
