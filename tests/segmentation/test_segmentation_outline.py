@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from physics3d.segmentation.outline import minimum_cut, outlined, price_of_parting
+from physics3d.segmentation.outline import likelier, minimum_cut, outlined, price_of_parting
 
 SIZE = (60, 80)
 BLUE, RED, BLACK = [90, 110, 150], [200, 90, 70], [30, 30, 30]
@@ -74,3 +74,15 @@ def test_colours_move_a_guess_that_is_not_sure():
     image = photograph(share, RED, BLUE)
     found = outlined(image, np.maximum(0.98 * share, 0.7 * beside))
     assert overlap(found, share > 0.5) > 0.98
+
+
+def test_a_colour_new_to_both_sides_says_nothing():
+    # the object shows a tenth of what the surroundings show: else the new colour, as rare in both, would speak for it
+    colour = np.zeros((*SIZE, 3), np.float32)
+    colour[:, :8], colour[:, 70:] = (60, 60, 0), (60, 0, 90)
+    on, off = np.zeros(SIZE), np.zeros(SIZE)
+    on[:, :8], off[:, 8:70] = 1.0, 1.0
+    odds = likelier(colour, on, off)
+    assert odds[:, :8].min() > 3 and odds[:, 8:26].max() < -3
+    # regions differ a little in what is common to both
+    assert abs(odds[:, 70:]).max() < 0.1
