@@ -220,8 +220,8 @@ def verdicts(rows: list[dict]) -> list[str]:
         f"looking at the truth of the twins of seed {SEED}: theirs are values of a set that was tuned on. The "
         f"fresh seeds {', '.join(map(str, FRESH))} vary petals, leaves, soil and pot, but neither cameras nor the "
         "kind of scene. They were measured twice: the first time the stem of seed 3 took in the soil (0.87 per pixel), "
-        f"as did that of seed {SEED} as reconstructed (0.69); on the latter it was then mended that a colour new to both "
-        "sides spoke for the object. How strange soil is to be taken for the object is still near a threshold.",
+        f"as did that of seed {SEED} as reconstructed (0.69); on the latter it was then mended that a colour new to "
+        "both sides spoke for the object. How strange soil is to be taken for the object is still near a threshold.",
         f"- The ball with masks below {WIDTH} px: {coarse} per pixel and per Gaussian. Its lower rim, in shadow and of "
         "the wood's colour, is then as thin as the outline is unsure, and its Gaussians go to the table.",
     ]
