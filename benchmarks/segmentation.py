@@ -207,7 +207,7 @@ def verdicts(rows: list[dict]) -> list[str]:
             )
     usual = [r for r in rows if (r["views"], r["size"], r["rounds"], r["masker"]) == (MANY, WIDTH, 2, "GrabCut")]
     for what, why in (
-        ("pixel", "What is wrong are single pixels of the outline, of which thin leaves have many"),
+        ("pixel", "By some thousandths: single pixels of the outline, of which leaves have many; by more: soil taken for stem"),
         ("gaussian", "Gaussians that lie across the boundary have one label; the rows with exact masks are the most"),
     ):
         short = [(ASKED[what] - r[what], r) for r in usual if r[what] < ASKED[what]]
@@ -221,9 +221,10 @@ def verdicts(rows: list[dict]) -> list[str]:
         f"fresh seeds {', '.join(map(str, FRESH))} vary petals, leaves, soil and pot, but neither cameras nor the "
         "kind of scene. They were measured twice: the first time the stem of seed 3 took in the soil (0.87 per pixel), "
         f"as did that of seed {SEED} as reconstructed (0.69); on the latter it was then mended that a colour new to "
-        "both sides spoke for the object. How strange soil is to be taken for the object is still near a threshold.",
-        f"- The ball with masks below {WIDTH} px: {coarse} per pixel and per Gaussian. Its lower rim, in shadow and of "
-        "the wood's colour, is then as thin as the outline is unsure, and its Gaussians go to the table.",
+        "both sides spoke for the object. This did not help seed 3: soil that the prompted view does not show may be "
+        "the stem's until a view tells, and whether it is taken is near a threshold.",
+        f"- The ball with masks below {WIDTH} px: {coarse} per pixel and per Gaussian. Its far side has other colours, "
+        "which coarse masks do not always carry, and its lower rim, in shadow, goes to the table.",
     ]
     lines.append("- SAM 2 has not been measured: its weights were not at hand. The tests run it with random weights.")
     return lines
