@@ -207,7 +207,7 @@ def verdicts(rows: list[dict]) -> list[str]:
             )
     usual = [r for r in rows if (r["views"], r["size"], r["rounds"], r["masker"]) == (MANY, WIDTH, 2, "GrabCut")]
     for what, why in (
-        ("pixel", "By some thousandths: single pixels of the outline, of which leaves have many; by more: soil taken for stem"),
+        ("pixel", "By some thousandths: single pixels of the outline, many at leaves; by more: soil taken for stem"),
         ("gaussian", "Gaussians that lie across the boundary have one label; the rows with exact masks are the most"),
     ):
         short = [(ASKED[what] - r[what], r) for r in usual if r[what] < ASKED[what]]
