@@ -1,9 +1,10 @@
 """Masks -> one label per Gaussian: the label whose pixels it contributes most to, summed over views.
 
-    A_k = sum over views and pixels of label k of (blending weight of the Gaussian),   label = argmax_k A_k
+    A_k = sum over views and pixels of label k of t (blending weight of the Gaussian),   label = argmax_k A_k
 
-which minimises sum |rendered label - mask| in closed form, because rendering is linear in the labels (Shen et al. 2024,
-"FlashSplat"). A Gaussian that shows nowhere takes the label of its neighbours.
+which minimises sum t |rendered label - mask| in closed form, because rendering is linear in the labels (Shen et al.
+2024, "FlashSplat", with t = 1). Here t is small next to outlines, across which Gaussians show: else the rim of a body,
+and what barely shows beside it, would take the wrong side. A Gaussian that shows nowhere takes its neighbours' label.
 """
 
 from collections.abc import Sequence
@@ -11,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy import sparse
+from scipy import ndimage, sparse
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -19,20 +20,30 @@ from physics3d.gaussians.cameras import Camera
 from physics3d.gaussians.model import Gaussians
 from physics3d.gaussians.rasterize import contribution, rasterize
 
-NEGLIGIBLE = 0.3  # [px] summed over views
+NEGLIGIBLE = 0.03  # [px] summed over views, as pixels count
 NEIGHBOURS = 8
+BLUNT = 1  # [px] from an outline, within which Gaussians show on both of its sides
+UNSURE = 0.1  # what a pixel counts there: enough for what is too thin to show elsewhere
 
 
 def contributions(
     gaussians: Gaussians, cameras: Sequence[Camera], maps: Sequence[Int[Tensor, "h w"]], count: int
 ) -> Float[Tensor, "n count"]:
-    """A [n, count] [px] for labels 0..count - 1, given a map of labels for every camera."""
+    """A [n, count] [px] for labels 0..count - 1, given a map of labels for every camera; pixels count by `trust`."""
     total = torch.zeros(len(gaussians), count)
     labels = torch.arange(count)[:, None, None]
     for camera, labelled in zip(cameras, maps, strict=True):
-        masks = (labelled[None] == labels).to(gaussians.mean.dtype).to(gaussians.mean.device)
+        masks = trust(labelled) * (labelled[None] == labels)
+        masks = masks.to(gaussians.mean.dtype).to(gaussians.mean.device)
         total += contribution(gaussians, camera, masks).cpu()
     return total
+
+
+def trust(labelled: Int[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """t of every pixel: 1 where all around it, as far as Gaussians are blunt, has one label."""
+    across = 1 + 2 * BLUNT
+    one = ndimage.minimum_filter(labelled.numpy(), across) == ndimage.maximum_filter(labelled.numpy(), across)
+    return torch.from_numpy(np.where(one, 1.0, UNSURE))
 
 
 def lift(mean: Float[Tensor, "n 3"], weights: Float[Tensor, "n count"]) -> Int[Tensor, " n"]:
@@ -68,20 +79,24 @@ def one_hot(label: Int[Tensor, " n"], count: int) -> Float[Tensor, "n count"]:
 def expected(
     mean: Float[Tensor, "n 3"], weights: Float[Tensor, "n count"], rooms: Bool[Tensor, "k n"]
 ) -> tuple[Float[Tensor, "n k"], Float[Tensor, "n k"]]:
-    """(what the views so far say of the parts 1..k, what may be added): the second of Gaussians that none has shown.
+    """(what the views so far say of the parts 1..k, what may be added): shares of a belief that add up to at most 1.
 
-    Those may be of the part nearest to them whose room holds them. A label is kept only in the part's room.
+        said_ik = A_ik/(A_i + c),   possible_ik = c/(A_i + c) of the part nearest to it,   c = sum A_ik^2/(2 sum A_ik)
+
+    so that what has shown half as much as Gaussians of parts usually do is half known. Neither reaches out of a room.
     """
-    shown = weights.sum(1) > NEGLIGIBLE
-    said = one_hot(lift(mean, weights), len(rooms)) * rooms.T * shown[:, None]
+    total, of_parts = weights.sum(1, keepdim=True), weights[:, 1:]
+    usual = 0.5 * float((of_parts**2).sum() / of_parts.sum().clamp_min(1e-9))
+    unknown = usual / (total + usual).clamp_min(1e-9)
+    label = lift(mean, weights) * (total[:, 0] > NEGLIGIBLE)
     position, nearest = mean.double().numpy(), torch.full(rooms.T.shape, torch.inf, dtype=torch.float64)
     for k, room in enumerate(rooms):
-        of_part, open_ = said[:, k] > 0, room & ~shown
-        if of_part.any() and open_.any():
-            distance, _ = cKDTree(position[of_part.numpy()]).query(position[open_.numpy()])
-            nearest[open_, k] = torch.from_numpy(distance)
+        of_part = (label == k + 1) & room
+        if of_part.any():
+            distance, _ = cKDTree(position[of_part.numpy()]).query(position[room.numpy()])
+            nearest[room, k] = torch.from_numpy(distance)
     possible = torch.nn.functional.one_hot(nearest.argmin(1), len(rooms)) * torch.isfinite(nearest)
-    return said, possible.float()
+    return rooms.T * of_parts / (total + usual).clamp_min(1e-9), possible * unknown
 
 
 def islands(

@@ -19,7 +19,8 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 
 from physics3d.priors.weights import hub_answers
-from physics3d.segmentation.pixels import bounds, centres, depth_in, eroded, size_of, thinned
+from physics3d.segmentation.outline import outlined
+from physics3d.segmentation.pixels import bounds, centres, eroded, thinned
 
 SURE = 0.95  # share of a pixel above which it is the object's, and 1 - SURE below which it is not
 UNLIKE = 15.0  # Lab units to the nearest sample: what is in the box and farther resembles nothing outside it
@@ -57,7 +58,7 @@ class AbstractVideoMasker(AbstractMasker):
 
 @dataclass(frozen=True, kw_only=True)
 class GrabCut(AbstractMasker):
-    """Colour models of object and surroundings, separated by a minimum cut (OpenCV)."""
+    """Colour models of object and surroundings, separated by a minimum cut: OpenCV's, or near a guess our `outline`."""
 
     iterations: int = 5
     most_points: int = 400
@@ -95,17 +96,13 @@ class GrabCut(AbstractMasker):
         return without_specks(connected_to(closed.astype(bool), positive))
 
     def refine(self, image, share):
-        """The outline is cut in a band about the guess, a tenth of the object wide, so that thin things return."""
-        import cv2
-
+        """By `outline`, in the surroundings of the guess, and with small holes of the guess's own filled."""
         guess = share > 0.5
         if not guess.any():
             return guess
-        kinds = np.where(guess, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
-        kinds[(share > SURE) & (depth_in(guess) > 2)] = cv2.GC_FGD
-        kinds[(share < 1 - SURE) & (depth_in(~guess) > max(4, 0.1 * size_of(guess)))] = cv2.GC_BGD
         left, top, right, bottom = bounds(centres(guess), 0.5, guess.shape, share=1.0).astype(int)
-        mask = cut(image, kinds, (slice(top, bottom), slice(left, right)), self.iterations)
+        near, mask = (slice(top, bottom), slice(left, right)), np.zeros_like(guess)
+        mask[near] = outlined(image[near], share[near])
         return mask | (without_specks(mask) & guess)
 
 

@@ -1,10 +1,10 @@
 """What a person says about one photograph, carried to the others through the Gaussians.
 
-The mask of the prompted photograph labels the Gaussians that it shows (see `lift`); those that it hides may be the
-object's where there is room. Drawn from the next camera this says of every pixel which share is the object's, and the
-masker finds the outline near there. Views are taken in the order of their angle to the prompted one, and each adds what
-it shows, so that the far side is reached step by step. What is farther behind the prompted view's surface than the
-object is wide is never part of it: prompt a view that shows it large.
+The mask of the prompted photograph labels the Gaussians that it shows (see `lift`); those that it hides or barely
+shows may be the object's where there is room. Drawn from the next camera this says of every pixel which share is the
+object's, and the masker finds the outline near there. Views are taken in the order of their angle to the prompted one,
+and each adds what it shows, so that the far side is reached step by step. What is farther behind the prompted view's
+surface than the object is wide is never part of it: prompt a view that shows it large.
 """
 
 from dataclasses import dataclass
@@ -20,9 +20,9 @@ from physics3d.gaussians.rasterize import Rendered
 from physics3d.log import Log
 from physics3d.segmentation.lift import contributions, expected, shares
 from physics3d.segmentation.masks import AbstractMasker, AbstractVideoMasker
-from physics3d.segmentation.pixels import centres, eroded, size_of, thinned
+from physics3d.segmentation.pixels import centres, depth_in, eroded, size_of, thinned
 
-UNSEEN = 0.9  # belief that what may be a part is one, before a view shows it: likely, but never sure
+UNSEEN = 0.7  # belief that what may be a part is one, before a view shows it: likelier than not, for colours to decide
 LEAST_SHOWN = 20  # pixels; a part that shows less in a view is not looked for there
 
 
@@ -237,10 +237,11 @@ def carry_masks(
             mask = np.zeros(share.shape, bool)
             if (share > 0.5).sum() >= LEAST_SHOWN:  # else it is behind another part
                 mask = followed[part][path.index(view)] if followed else masker.refine(view.image, share)
-                mask = mask & ~clearly_outside(rooms[part], view, share > 0.5) & wins(share, drawn)
+                mask = mask & ~clearly_outside(rooms[part], view, share > 0.5)
                 recall = min(recall, share_of(sure > 0.5, mask))
                 leak = max(leak, share_of(mask, eroded(share < 0.05, 0.1 * size_of(share > 0.5))))
             found[part] = mask
+        found = dict(zip(found, contested(list(found.values()), drawn)))
         if recall < 0.6 or leak > 0.3:
             log.info(
                 f"{view.name}: a mask holds {100 * recall:.0f} % of what other views say is the object's, and "
@@ -252,9 +253,10 @@ def carry_masks(
     return masks
 
 
-def wins(share: Float[np.ndarray, "h w"], drawn: Float[np.ndarray, "k h w"]) -> Bool[np.ndarray, "h w"]:
-    """Where two parts meet both outlines are guesses: a pixel may only be of the part that shows most there."""
-    return share >= drawn.max(0) - 1e-6
+def contested(masks: list[Bool[np.ndarray, "h w"]], drawn: Float[np.ndarray, "k h w"]) -> list[Bool[np.ndarray, "h w"]]:
+    """Where two parts meet both outlines are guesses: a pixel that both claim is of the one that shows most there."""
+    claims = np.where(masks, drawn, -1.0)
+    return [mask & (share >= claims.max(0) - 1e-6) for mask, share in zip(masks, drawn)]
 
 
 def numbered(masks: list[Bool[np.ndarray, "h w"]]) -> Int[np.ndarray, "h w"]:
@@ -266,8 +268,11 @@ def numbered(masks: list[Bool[np.ndarray, "h w"]]) -> Int[np.ndarray, "h w"]:
 
 
 def clearly_outside(room: Room, view: View, guess: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Pixels well inside the area that shows what is outside the room: where thin things end, depth is a mix."""
-    return eroded(room.excludes(view), 0.06 * size_of(guess))
+    """Pixels well inside the area that shows what is outside the room: where thin things end, depth is a mix.
+
+    Where the reconstruction has gaps no pixel may be well inside; then the room only binds Gaussians.
+    """
+    return depth_in(room.excludes(view)) > 0.06 * size_of(guess)
 
 
 def share_of(part: Bool[np.ndarray, "h w"], whole: Bool[np.ndarray, "h w"]) -> float:
@@ -312,9 +317,9 @@ def refined_masks(
             mask = masker.refine(view.image, share)
             if room is not None:
                 mask = mask & ~clearly_outside(room, view, guess)
-            mask = (mask if overlap(mask, guess) > 0.6 else guess) & wins(share, drawn)
+            mask = mask if overlap(mask, guess) > 0.6 else guess
         found.append(mask)
-    return found
+    return contested(found, drawn)
 
 
 def mask_of_box(prompt: Prompt, view: View, masker: AbstractMasker) -> Bool[np.ndarray, "h w"] | None:
