@@ -53,7 +53,7 @@ test: $(ready) ## everything that needs no GPU and no weights
 bench: $(ready) bench-speed bench-renderer bench-filling bench-embedding bench-simulation bench-stability bench-segmentation bench-reconstruction ## measurements with plots, into docs/results; one alone: make bench-<name>
 
 bench-%: $(ready)
-	@$(py) benchmarks/$*.py $(ARGS)
+	@OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(py) benchmarks/$*.py $(ARGS)
 
 lint: $(ready) ## style and types
 	@$(py) -m ruff check . && $(py) -m ruff format --check . && $(py) -m mypy

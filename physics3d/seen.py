@@ -94,7 +94,8 @@ def seen(
     x = torch.from_numpy(lower + h * np.indices(count).reshape(3, -1).T).float()
     covariance, moves = gaussians.covariance(), (label > 0).to(gaussians.mean)
     shown = moves[:, None].expand(-1, 3)
-    precision = torch.linalg.inv(covariance.double() + 1e-10 * torch.eye(3, dtype=torch.float64))
+    floor = (1e-3 * spacing) ** 2 * torch.eye(3, dtype=torch.float64)  # discs of no thickness have an inverse too
+    precision = torch.linalg.inv(covariance.double() + floor)
     which = np.unique(np.linspace(0, len(cameras) - 1, min(MOST_VIEWS, len(cameras))).round().astype(int))
     outline = torch.full((max(2, len(which) // 10), len(x)), -t)  # the largest
     total, looks = torch.zeros(len(x)), torch.zeros(len(x))
