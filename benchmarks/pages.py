@@ -34,6 +34,9 @@ PHOTOGRAPHS = {
     ("learn", "reference_above_learned.png"),
     ("evaluate", "frames*.png"),
 }
+# of data without a licence only what is plotted is shown
+PLOTS = {("fill", "slices.png"), ("learn", "parameters.png"), ("simulate", "motion.png"), ("evaluate", "bars.png")}
+UNLICENSED = ("lego",)
 
 
 def main(words: list[str]) -> None:
@@ -64,6 +67,8 @@ def main(words: list[str]) -> None:
         previews = steps[stage].folder / "previews"
         for pattern in patterns:
             if real and (stage, pattern) in PHOTOGRAPHS:
+                continue
+            if picked["scene"] in UNLICENSED and (stage, pattern) not in PLOTS:
                 continue
             picture = max(previews.glob(pattern), default=None)  # the last step of a series
             if picture is None:

@@ -36,7 +36,7 @@ from physics3d.mpm.boundaries.base import AbstractBoundary
 from physics3d.mpm.boundaries.fixed_region import FixedRegion
 from physics3d.mpm.boundaries.held_particles import HeldParticles
 from physics3d.open3d_import import open3d
-from physics3d.seen import Seen, ground, seen
+from physics3d.seen import Ground, Seen, ground, seen
 
 DIRECTIONS = np.array(
     [d for d in itertools.product((-1, 0, 1), repeat=3) if any(d)]
@@ -47,6 +47,7 @@ SUBDIVISION = 4  # samples along each side of a boundary cell
 ISOLATED = ("attach", "drop", "keep")  # what may become of a piece
 JOINT = 4.0  # widest gap that is bridged [spacings]: two cells of the simulation grid
 CONTACT = (0.6, 1.0)  # particles nearer to a static Gaussian are held by it; at most, where none is so near [spacings]
+LEAST_SEEN = 0.1  # share of the samples of solid parts that cameras must see; a usual fit has 0.6 and more
 SPECK = 0.05  # static clusters of less than this share are mistakes of the segmentation and hold nothing
 
 
@@ -101,7 +102,7 @@ class Surface:
     normal: np.ndarray  # [m, 3] unit, outward
     enclosure: "Enclosure"  # where the samples are met by rays
     thin: np.ndarray  # [m] bool: both sides see the sky
-    hidden: np.ndarray  # [m] bool: neither side does
+    hidden: np.ndarray  # [m] bool: neither side does, or no camera sees a surface near it
 
 
 class AbstractSolid:
@@ -284,21 +285,22 @@ def fill(
     static = gaussians.select((label == 0) & (gaussians.opacity > opacity))
     view, below = None, None
     if cameras:
-        at = shown.mean.double().numpy()
+        at, _ = spread(shown, spacing / 2)
         box = dict(lower=at.min(0) - 2 * spacing, upper=at.max(0) + 2 * spacing)
         view = seen(gaussians, label, cameras, **box, spacing=spacing, log=log)
-        below = ground(gaussians, label, cameras, **box, spacing=spacing, log=log)
-    surface, deviation = sample_surface(shown, spacing, beside=static, view=view)
+        below = ground(gaussians, label, cameras, **box, spacing=spacing, opacity=opacity, log=log)
+    else:
+        log.info("no cameras: the surface is taken a deviation outside the Gaussians' centres")
+    surface, deviation = sample_surface(shown, spacing, beside=static, view=view, below=below, log=log)
     within = solid.inside(surface, spacing)
 
     def inside(x: np.ndarray) -> np.ndarray:
         found = within(x)
         if view is not None:
             found &= ~view.beside(x)
-        if (
-            view is not None and below is not None
-        ):  # a spacing deep, for it is a guess under the body; what is seen of the body is none
-            found[found] &= ~(view.deep(x[found]) & (below(x[found]) > spacing))
+            # a spacing below the ground, which is a guess under the body, and never what is seen of the body
+            if below is not None and found.any():
+                found[found] &= ~(view.deep(x[found]) & (below.behind(x[found]) > spacing))
         return found
 
     position, volume = solid_cells(inside, surface.point, spacing)
@@ -310,6 +312,8 @@ def fill(
         uncovered = cKDTree(position).query(surface.point)[0] > 1.2 * spacing
     else:
         uncovered = np.ones(len(surface.point), bool)
+    if view is not None:  # nor is there a sheet where the cameras see none
+        uncovered &= ~view.beside(surface.point) & ~view.deep(surface.point)
     thin_position, thin_area = sheet(surface.point[uncovered], surface.normal[uncovered], spacing)
     thickness = sheet_thickness
     if thickness is None and uncovered.any():
@@ -378,12 +382,19 @@ def spread(gaussians: Gaussians, step: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def sample_surface(
-    gaussians: Gaussians, spacing: float, *, beside: Gaussians | None = None, view: Seen | None = None
+    gaussians: Gaussians,
+    spacing: float,
+    *,
+    beside: Gaussians | None = None,
+    view: Seen | None = None,
+    below: Ground | None = None,
+    log: Log = Log(None),
 ) -> tuple[Surface, np.ndarray]:
     """Samples about half a spacing apart, and the least deviation [m] of the Gaussians at each.
 
     `beside` are Gaussians that do not belong to the body but hide the sky: what it stands on or leans against. `view`
-    is what cameras see: samples of solid parts are moved onto its surface, those not near it are inside and left out.
+    is what cameras see: samples of solid parts are moved onto its surface, those not near it are inside and left out;
+    `below` closes it where it stands or leans.
     """
     step = spacing / 2
     point, owner = spread(gaussians, step)
@@ -427,8 +438,24 @@ def sample_surface(
     if view is not None:
         moved, outside, found = view.settled(point, 1.5 * spacing)
         solid = ~thin & ~hidden
+        share = float(found[solid].mean()) if solid.any() else 1.0
+        log.info(f"{100 * share:.0f} % of the samples of solid parts are near the surface that the cameras see")
+        if share < LEAST_SEEN:
+            raise ValueError(
+                f"the cameras see the surface of the body near {100 * share:.1f} % of its Gaussians only; cameras, "
+                "Gaussians and labels do not belong together: look at the previews of reconstruct and segment"
+            )
         point, normal = (np.where((solid & found)[:, None], a, b) for a, b in ((moved, point), (outside, normal)))
-        return Surface(point, normal, enclosure, thin=thin, hidden=hidden | (solid & ~found)), deviation
+        hidden = hidden | (solid & ~found)
+        if below is not None:  # the side of the body that no camera sees is where the ground begins
+            under = view.deep(below.hidden) & ~view.beside(below.hidden)
+            point = np.concatenate([point, below.hidden[under]])
+            normal = np.concatenate([normal, -below.normal[under]])
+            more = np.zeros(int(under.sum()))
+            thin, hidden = (np.concatenate([a, more > 0]) for a in (thin, hidden))
+            deviation = np.concatenate([deviation, more])
+        # what is filled reaches out to the samples where they are now
+        return Surface(point, normal, Enclosure(np.concatenate([walls, point]), h), thin=thin, hidden=hidden), deviation
     # what is seen of a fitted Gaussian is its outer side, a deviation away from its centre
     outward = np.where(thin | hidden, 0.0, deviation)[:, None] * normal
     return Surface(point + outward, normal, enclosure, thin=thin, hidden=hidden), deviation

@@ -64,16 +64,18 @@ class Seen:
     def settled(self, x: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Points [m, 3] moved onto the surface, at most `reach` [m]; its outward normals there; which have found it."""
         slope = np.stack(np.gradient(self.distance, self.h), -1)
+        gradient = lambda at: np.stack([self._at(slope[..., k], at) for k in range(3)], 1)
         moved = x.copy()
         for _ in range(8):
-            g = np.stack([self._at(slope[..., k], moved) for k in range(3)], 1)
+            g = gradient(moved)
             size = np.linalg.norm(g, axis=1, keepdims=True)
-            normal = g / np.maximum(size, 1e-9)
             # distances of several cameras are not quite distances: their slope is between a third and one
             step = -self._at(self.distance, moved)[:, None] / np.clip(size, 0.33, 1.0)
-            moved = moved + np.clip(step, -self.h, self.h) * normal
+            moved = moved + np.clip(step, -self.h, self.h) * g / np.maximum(size, 1e-9)
+        g = gradient(moved)
+        size = np.linalg.norm(g, axis=1)
         found = (np.abs(self._at(self.distance, moved)) < 0.25 * self.h) & (np.linalg.norm(moved - x, axis=1) <= reach)
-        return moved, normal, found
+        return moved, g / np.maximum(size, 1e-9)[:, None], found & (size > 0.1)
 
 
 def seen(
@@ -89,41 +91,47 @@ def seen(
     """What the cameras see, in the box `lower`..`upper` [m], of the Gaussians with label > 0 that are to be particles
     `spacing` [m] apart. At most MOST_VIEWS of the cameras are asked."""
     h = max(spacing / PER_SPACING, float(np.prod(upper - lower) / MOST_POINTS) ** (1 / 3))
+    if h > 0.5 * spacing:
+        log.info(
+            f"surfaces are looked at every {1e3 * h:.2g} mm, coarser than the particles: the body is large for them"
+        )
     t = max(0.75 * spacing, 2 * h)
     count = np.ceil((upper - lower) / h).astype(int) + 1
     x = torch.from_numpy(lower + h * np.indices(count).reshape(3, -1).T).float()
-    covariance, moves = gaussians.covariance(), (label > 0).to(gaussians.mean)
-    shown = moves[:, None].expand(-1, 3)
+    covariance = gaussians.covariance()
+    shown = (label > 0).to(gaussians.mean)[:, None].expand(-1, 3)
     floor = (1e-3 * spacing) ** 2 * torch.eye(3, dtype=torch.float64)  # discs of no thickness have an inverse too
-    precision = torch.linalg.inv(covariance.double() + floor)
+    mean, precision = gaussians.mean.double().cpu(), torch.linalg.inv(covariance.double().cpu() + floor)
+    moving = label.cpu() > 0
     which = np.unique(np.linspace(0, len(cameras) - 1, min(MOST_VIEWS, len(cameras))).round().astype(int))
-    outline = torch.full((max(2, len(which) // 10), len(x)), -t)  # the largest
+    mistaken = max(len(which) // 10, int(len(which) > 1))  # cameras that may be
+    outline = torch.full((1 + mistaken, len(x)), -t)  # the largest
     total, looks = torch.zeros(len(x)), torch.zeros(len(x))
-    for camera in log.progress([cameras[i] for i in which], "looking at the body"):
-        camera = _as_fine_as(spacing / 3, camera, x)
+    for camera in log.progress([cameras[i] for i in which], "looking at surfaces"):
+        camera = _as_fine_as(spacing / PER_SPACING, camera, x)
         with torch.no_grad():
             drawn = rasterize(
                 gaussians.mean, covariance, gaussians.opacity, shown, camera, background=(0.0, 0.0, 0.0), median=True
             )
-        ray = gaussians.mean.double() - camera.centre
+        ray = mean - camera.centre
         ray = ray / (ray @ camera.world_to_camera[2, :3])[:, None]
         deviation = torch.einsum("ni,nij,nj->n", ray, precision, ray).rsqrt().float()  # of the depth [m]
         at, median = drawn.at.long().cpu(), drawn.median.cpu()  # type: ignore[union-attr]
         front = torch.where(at >= 0, median - LIMB * deviation[at], FAR)
-        body = (at >= 0) & (moves.cpu()[at] > 0)
+        body = (at >= 0) & moving[at]
         shown_at, hidden_at = torch.where(body, front, -FAR), torch.where(body, FAR, front)
         uv, z = camera.project(x)
         within = (z > 0) & (uv >= 0).all(1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
         pixel = 2 * uv / torch.tensor([camera.width, camera.height]) - 1
         share = _read(drawn.color[..., 0].cpu(), pixel, "bilinear")
         d, hidden = _read(shown_at, pixel, "nearest"), _read(hidden_at, pixel, "nearest")
-        past = ((0.5 - share) * EDGE / camera.fx * z).clamp(-t, t)
+        past = ((0.5 - share) * EDGE / (camera.fx * camera.fy) ** 0.5 * z).clamp(-t, t)
         past = torch.where(within & ((share >= 0.5) | (z < hidden - t)), past, -t)
         outline = torch.cat([outline, past[None]]).topk(len(outline), dim=0).values
         near = within & (z < d + t)
         total += torch.where(near, (d - z).clamp(max=t), 0)
         looks += near
-    unseen = looks < min(2, len(which))  # one camera alone may be mistaken
+    unseen = looks <= min(1, mistaken)
     distance = torch.where(unseen, -t, total / looks.clamp_min(1))
     lattice = lambda values: values.reshape(*count).double().numpy()
     smooth = lambda values: ndimage.gaussian_filter(lattice(values), 0.7)
@@ -132,9 +140,20 @@ def seen(
         h=h,
         distance=smooth(torch.maximum(distance, outline[-1])),
         outline=smooth(outline[-1]),
-        unseen=lattice(unseen),
+        unseen=lattice(unseen & (outline[-1] <= 0)),
         truncation=t,
     )
+
+
+@dataclass(frozen=True)
+class Ground:
+    """What the body stands on or leans against: a surface closed under the body."""
+
+    behind: Callable[
+        [np.ndarray], np.ndarray
+    ]  # how deep [m] points [m, 3] lie, along the normal of the nearest triangle
+    hidden: np.ndarray  # [k, 3] points of it that no camera sees [m]
+    normal: np.ndarray  # [k, 3] there, out of the ground
 
 
 def ground(
@@ -145,15 +164,18 @@ def ground(
     lower: np.ndarray,
     upper: np.ndarray,
     spacing: float,
+    opacity: float,
     log: Log,
-) -> Callable[[np.ndarray], np.ndarray] | None:
-    """How deep points [m, 3] lie behind what is static around the box of a body [m], positive behind; None if there is
-    too little of it to say. Seen at half the resolution of the body, `spacing` [m]."""
+) -> Ground | None:
+    """Of what is static, label 0 and above this `opacity`, around the box of a body [m]; None if there is too little.
+
+    It is seen at half the resolution of the body, whose particles are `spacing` [m] apart.
+    """
     reach = GROUND * float((upper - lower).max())
     box = dict(lower=lower - reach, upper=upper + reach)
-    mean = gaussians.mean.double()
-    around = (mean > torch.from_numpy(box["lower"])).all(1) & (mean < torch.from_numpy(box["upper"])).all(1)
-    static = gaussians.mean[around & (label == 0)].double().numpy()
+    mean = gaussians.mean.double().cpu().numpy()
+    around = ((mean > box["lower"]) & (mean < box["upper"])).all(1)
+    static = mean[around & ((label == 0) & (gaussians.opacity > opacity)).cpu().numpy()]
     if len(static) < LEAST_GROUND:
         return None
     view = seen(gaussians, (label == 0).int(), cameras, **box, spacing=2 * spacing, log=log)
@@ -166,14 +188,17 @@ def ground(
     cloud.normals = o3d.utility.Vector3dVector(normal[found])
     depth = int(np.clip(np.ceil(np.log2((upper - lower + 2 * reach).max() / (2 * spacing))), 6, 8))
     mesh, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, n_threads=1)
+    mesh.compute_vertex_normals()
     scene = o3d.t.geometry.RaycastingScene(nthreads=1)
     scene.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(mesh))
 
     def behind(x: np.ndarray) -> np.ndarray:
-        nearest = scene.compute_closest_points(o3d.core.Tensor(x.astype(np.float32)))
+        nearest = scene.compute_closest_points(o3d.core.Tensor(x.astype(np.float32)), nthreads=1)
         return -((x - nearest["points"].numpy()) * nearest["primitive_normals"].numpy()).sum(1)
 
-    return behind
+    vertex, outward = np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals)
+    hidden = view.deep(vertex) & ((vertex > lower) & (vertex < upper)).all(1)
+    return Ground(behind=behind, hidden=vertex[hidden], normal=outward[hidden])
 
 
 def _read(picture: Float[Tensor, "h w"], pixel: Float[Tensor, "m 2"], mode: str) -> Float[Tensor, " m"]:
@@ -184,6 +209,7 @@ def _read(picture: Float[Tensor, "h w"], pixel: Float[Tensor, "m 2"], mode: str)
 
 
 def _as_fine_as(size: float, camera: Camera, x: Float[Tensor, "m 3"]) -> Camera:
-    """The camera with pixels of about `size` [m] at the body, but no more of them than it has."""
-    _, z = camera.project(x[:: max(1, len(x) // 100)])
-    return camera.scaled(min(1.0, float(z.median()) / (camera.fx * size)))
+    """The camera with pixels of about `size` [m] at the points before it, but no more of them than it has."""
+    _, z = camera.project(x[:: max(1, len(x) // 1000)])
+    ahead = z[z > 0]
+    return camera.scaled(min(1.0, float(ahead.median()) / (camera.fx * size))) if len(ahead) else camera

@@ -60,6 +60,6 @@ def rasterize_plainly(
     depth = torch.where(seen, torch.einsum("nhw,n->hw", weight, z) / torch.where(seen, 1 - end, 1), 0)
     here = (clear[:-1] >= 0.5) & (clear[1:] < 0.5)  # at most once along a ray
     middle = torch.einsum("nhw,n->hw", here.to(z), z) if median else None
-    at = torch.einsum("nhw,n->hw", here.long(), order + 1).int() - 1 if median else None
+    at = (here * (order + 1)[:, None, None]).sum(0).int() - 1 if median else None
     picture = torch.einsum("nhw,nc->hwc", weight, color) + end[..., None] * background.to(mean)
     return Rendered(color=picture, alpha=1 - end, depth=depth, median=middle, at=at)

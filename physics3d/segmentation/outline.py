@@ -21,7 +21,7 @@ FEW = 15.0  # pixels of a side in a region, fewer of which say little of its col
 COLOURS = 500.0  # that a side may have
 SMOOTH = 4.0  # price of a pixel's length of outline where nothing shows
 MEET = 1.0  # reach of the colours that meet at the outline [px]
-NOISE = 3.0  # least standard deviation of such a colour [Lab units]
+NOISE = 3.0  # standard deviation that every such colour has at least [Lab units]
 MIXED = 0.1  # what a pixel next to the outline counts among the colours of its side
 ROUNDS = 2  # the second learns colours from the outline of the first
 
@@ -83,7 +83,8 @@ def away_from_outline(mask: Bool[np.ndarray, "h w"]) -> tuple[Bool[np.ndarray, "
 def nearer_half(
     colour: Float[np.ndarray, "h w 3"], inner: Bool[np.ndarray, "h w"], outer: Bool[np.ndarray, "h w"]
 ) -> Float[np.ndarray, "h w"]:
-    """The logarithm of odds by the colours a and b, of variance v, that meet at the outline: (c - (a + b)/2) (a - b)/v.
+    """The logarithm of odds by the colours a and b that meet at the outline: (c - (a + b)/2) (a - b)/v, v the sum of
+    the variances of the three channels and NOISE^2.
 
     Both are means over what is near but not next to it, so that their half is where half a pixel is covered. 0 except
     next to the outline, and where the object or its surroundings are too thin.

@@ -21,7 +21,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 Vector = tuple[float, float, float]
-NEAREST = 0.499  # cells: how far in front of a surface the nodes still stand for it that touching particles have
+NEAREST = 0.499  # [cells] how far in front of a surface nodes of touching particles still obey it
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -46,6 +46,8 @@ class HalfSpace(base.AbstractBoundary):
         base.require(self.friction >= 0, self, "friction", "a coefficient >= 0")
 
     def parameters(self, setting: base.Setting) -> Float[Tensor, "9"]:
+        """Point of the plane (3) [m], unit normal (3), friction, how far in front of it nodes belong to it and what is
+        forgiven a particle [m]."""
         normal = torch.tensor(self.normal, dtype=torch.float64)
         # what is on the plane belongs to the ground whatever the rounding
         slack = 1e-3 * setting.dx
