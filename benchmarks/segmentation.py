@@ -219,8 +219,8 @@ def verdicts(rows: list[dict]) -> list[str]:
         "- The thresholds of the method, the rule that places clicks and the clicks in conf/scene were chosen while "
         f"looking at the truth of the twins of seed {SEED}: theirs are values of a set that was tuned on. The "
         f"fresh seeds {', '.join(map(str, FRESH))} vary petals, leaves, soil and pot, but neither cameras nor the "
-        "kind of scene. Where stem and pot of one twin are both far below the others', the stem has taken in soil: what "
-        "the prompted view does not show may be the stem's until a view tells, and whether it is taken is near a "
+        "kind of scene. Where stem and pot of one twin are both far below the others', the stem has taken in soil: "
+        "what the prompted view does not show may be the stem's until a view tells, and whether it is taken is near a "
         "threshold.",
         f"- The ball with masks below {WIDTH} px: {coarse} per pixel and per Gaussian. Its far side has other colours, "
         "which coarse masks do not always carry, and its lower rim, in shadow, goes to the table.",
