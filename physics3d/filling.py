@@ -447,9 +447,11 @@ def sample_surface(
             )
         point, normal = (np.where((solid & found)[:, None], a, b) for a, b in ((moved, point), (outside, normal)))
         hidden = hidden | (solid & ~found)
-        if below is not None:  # the side of the body that no camera sees is where the ground begins
+        if (
+            below is not None
+        ):  # where no camera sees the body it ends a spacing below the ground, which is a guess there
             under = view.deep(below.hidden) & ~view.beside(below.hidden)
-            point = np.concatenate([point, below.hidden[under]])
+            point = np.concatenate([point, (below.hidden - spacing * below.normal)[under]])
             normal = np.concatenate([normal, -below.normal[under]])
             more = np.zeros(int(under.sum()))
             thin, hidden = (np.concatenate([a, more > 0]) for a in (thin, hidden))
