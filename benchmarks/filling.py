@@ -41,7 +41,7 @@ from stages.reconstruct import Reconstruct
 RESULTS = Path(__file__).parents[1] / "docs/results"
 SPACING, SEED = 0.006, 0
 PETAL_THICKNESS = 0.001  # [m]
-STEM_SPACING, STEM_FROM, SLICES = 0.007, 0.085, 6  # as conf/scene/carnation.yaml; from above the soil [m]
+STEM_SPACING, STEM_FROM, SLICES = 0.006, 0.085, 6  # as conf/scene/carnation.yaml; from above the soil [m]
 LEAVES_FROM = 0.017  # the axis, of a stem 25 mm thick [m]
 CONDITIONS = ("clean", "noise 1 mm", "noise 2 mm", "holes", "cap missing")
 norm = np.linalg.norm

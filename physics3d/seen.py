@@ -6,7 +6,7 @@ is its pictures. A camera tells of a point x at depth z, with the pixel it falls
     outline    (1/2 - m) / |slope of m|, m the share of the pixel that is the body's: where m < 1/2, x is not the body's
                unless something static hides it
     depth      d - z where m >= 1/2 and z < d + t: in front of what is seen there, or just behind it; d is the depth of
-               the Gaussian at which half the light is gone, less its deviation along the ray
+               the Gaussian at which half the light is gone, less twice its deviation along the ray
 
 Outlines exclude: the distance is the largest but for a tenth of the cameras, so that a few mistaken masks carve
 nothing. Depths are uncertain: the distance is their mean, cut off at the truncation t (Curless and Levoy 1996). The
@@ -35,7 +35,7 @@ MOST_VIEWS = 32
 MOST_POINTS = 3_000_000  # of the lattice
 PER_SPACING = 3  # points of the lattice
 EDGE = 2.0  # [px] over which the share of an edge falls from 1 to 0: low pass, pixel and the Gaussians' own slope
-LIMB = 1.0  # what is seen of a Gaussian is its outer side, that many deviations before its centre
+LIMB = 2.0  # deviations by which the outlines of layers of Gaussians lie outside of their centres
 GROUND = 0.5  # how far around the body static Gaussians are looked at, of its size
 LEAST_GROUND = 100  # of them
 FAR = 1e6  # depth where nothing is seen [m]
@@ -188,6 +188,10 @@ def ground(
     cloud.normals = o3d.utility.Vector3dVector(normal[found])
     depth = int(np.clip(np.ceil(np.log2((upper - lower + 2 * reach).max() / (2 * spacing))), 6, 8))
     mesh, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, n_threads=1)
+    # the largest piece: the others are bubbles round strays
+    of, _, area = (np.asarray(a) for a in mesh.cluster_connected_triangles())
+    mesh.remove_triangles_by_mask(of != area.argmax())
+    mesh.remove_unreferenced_vertices()
     mesh.compute_vertex_normals()
     scene = o3d.t.geometry.RaycastingScene(nthreads=1)
     scene.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(mesh))
