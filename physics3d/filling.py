@@ -298,9 +298,10 @@ def fill(
         found = within(x)
         if view is not None:
             found &= ~view.beside(x)
-            # a spacing below the ground, which is a guess under the body, and never what is seen of the body
+            # below the ground, where it surely is, and never what is seen of the body
             if below is not None and found.any():
-                found[found] &= ~(view.deep(x[found]) & (below.behind(x[found]) > spacing))
+                buried = below.behind(x[found]) > spacing + below.doubt(x[found])
+                found[found] &= ~(view.deep(x[found]) & buried)
         return found
 
     position, volume = solid_cells(inside, surface.point, spacing)
@@ -447,11 +448,11 @@ def sample_surface(
             )
         point, normal = (np.where((solid & found)[:, None], a, b) for a, b in ((moved, point), (outside, normal)))
         hidden = hidden | (solid & ~found)
-        if (
-            below is not None
-        ):  # where no camera sees the body it ends a spacing below the ground, which is a guess there
+        if below is not None:
+            # where no camera sees the body it ends as far below the ground as that is in doubt
             under = view.deep(below.hidden) & ~view.beside(below.hidden)
-            point = np.concatenate([point, (below.hidden - spacing * below.normal)[under]])
+            end = below.hidden - (spacing + below.doubt(below.hidden))[:, None] * below.normal
+            point = np.concatenate([point, end[under]])
             normal = np.concatenate([normal, -below.normal[under]])
             more = np.zeros(int(under.sum()))
             thin, hidden = (np.concatenate([a, more > 0]) for a in (thin, hidden))

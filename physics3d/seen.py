@@ -23,6 +23,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy import ndimage
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from physics3d.gaussians.cameras import Camera
@@ -38,6 +39,7 @@ EDGE = 2.0  # [px] over which the share of an edge falls from 1 to 0: low pass, 
 LIMB = 2.0  # deviations by which the outlines of layers of Gaussians lie outside of their centres
 GROUND = 0.5  # how far around the body static Gaussians are looked at, of its size
 LEAST_GROUND = 100  # of them
+DOUBT = 0.5  # slope that the ground may have where nothing shows it
 FAR = 1e6  # depth where nothing is seen [m]
 
 
@@ -152,6 +154,9 @@ class Ground:
     behind: Callable[
         [np.ndarray], np.ndarray
     ]  # how deep [m] points [m, 3] lie, along the normal of the nearest triangle
+    doubt: Callable[
+        [np.ndarray], np.ndarray
+    ]  # by how much that may be wrong [m]: a share of the way to where it is seen
     hidden: np.ndarray  # [k, 3] points of it that no camera sees [m]
     normal: np.ndarray  # [k, 3] there, out of the ground
 
@@ -200,9 +205,11 @@ def ground(
         nearest = scene.compute_closest_points(o3d.core.Tensor(x.astype(np.float32)), nthreads=1)
         return -((x - nearest["points"].numpy()) * nearest["primitive_normals"].numpy()).sum(1)
 
+    known = cKDTree(point[found])
+    doubt = lambda x: DOUBT * known.query(x)[0]
     vertex, outward = np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals)
     hidden = view.deep(vertex) & ((vertex > lower) & (vertex < upper)).all(1)
-    return Ground(behind=behind, hidden=vertex[hidden], normal=outward[hidden])
+    return Ground(behind=behind, doubt=doubt, hidden=vertex[hidden], normal=outward[hidden])
 
 
 def _read(picture: Float[Tensor, "h w"], pixel: Float[Tensor, "m 2"], mode: str) -> Float[Tensor, " m"]:

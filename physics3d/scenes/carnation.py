@@ -2,7 +2,7 @@
 
 The flower stands in a terracotta pot on a wooden table. Everything above the soil moves, everything below it is fixed.
 What deforms is one viscoelastic solid: stem, calyx and the dome that the petals fill; the visible petals, sepals
-and leaves are thin sheets without mass, carried by it. The stem is kept thick so that cells of 1.2 to 1.5 cm resolve
+and leaves are thin sheets without mass, carried by it. The stem is kept thick so that cells of 1.2 cm resolve
 its bending. The photographed shape is the rest shape, so there is no gravity.
 
 The motion is computed by the project's own solver, but with a finer grid, other particles and other time steps than the
