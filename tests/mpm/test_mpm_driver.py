@@ -219,9 +219,9 @@ def test_sand_shears_at_its_friction_angle_and_bears_no_tension():
     path = torch.stack([size * ONE for size in (1.0, 1.02, 1.05, 1.02, 1.0, 0.99)])
     tau = driver.prescribed(DruckerPrager(), values, torch.arange(6, dtype=torch.float64), path)
     pressure = -tau.diagonal(dim1=-2, dim2=-1).mean(-1)
-    # back at its first volume the logarithm of it is 0 to some 1e-11, of either sign; times the stiffness
+    # once a solver has run in this process, kernels contract multiply-adds, and strains are right to 1e-10; times E
     torch.testing.assert_close(pressure[:5], torch.zeros(5, dtype=torch.float64), rtol=0, atol=1e-3)
-    assert pressure[5].item() == pytest.approx(-3 * math.log(0.99) * 1e6 / (3 * (1 - 0.6)), rel=1e-9)
+    assert pressure[5].item() == pytest.approx(-3 * math.log(0.99) * 1e6 / (3 * (1 - 0.6)), rel=1e-8)
 
 
 @pytest.mark.parametrize("n", [1.0, 0.5])
