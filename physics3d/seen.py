@@ -45,6 +45,8 @@ FAR = 1e6  # depth where nothing is seen [m]
 
 @dataclass(frozen=True)
 class Seen:
+    """What cameras see of one body: distances on a lattice, interpolated between its points."""
+
     lower: np.ndarray  # first point of the lattice [3] [m]
     h: float  # distance of its points [m]
     distance: np.ndarray  # [i, j, k] signed, positive outside, cut off at +- truncation [m]
