@@ -47,7 +47,9 @@ SUBDIVISION = 4  # samples along each side of a boundary cell
 ISOLATED = ("attach", "drop", "keep")  # what may become of a piece
 JOINT = 4.0  # widest gap that is bridged [spacings]: two cells of the simulation grid
 CONTACT = (0.6, 1.0)  # particles nearer to a static Gaussian are held by it; at most, where none is so near [spacings]
-LEAST_SEEN = 0.1  # share of the samples of solid parts that cameras must see; a usual fit has 0.6 and more
+LEAST_SEEN = (
+    0.1  # share of the samples of solid parts that cameras must see; fits of the scenes in conf/ have 0.66 and more
+)
 SPECK = 0.05  # static clusters of less than this share are mistakes of the segmentation and hold nothing
 
 
@@ -245,10 +247,10 @@ def fill(
     spacing [m]; Gaussians below `opacity`, or below half of the median one where that is less, become no particles but
     are embedded; `interior` False leaves a shell; `sheet_thickness` [m] of thin parts, None takes sqrt(12) times the
     median least deviation of their Gaussians; isolated pieces with less than the share `drop_pieces_below` of the
-    volume are dropped, of the others becomes what
-    `isolated` says, see `join_pieces`; `attach` marks the particles beside static Gaussians. `cameras` of the
-    photographs say where the surface is (`seen.py`); with none it is a deviation outside the Gaussians' centres.
-    Raises ValueError if nothing moves, or the lattice would be too large.
+    volume are dropped, of the others becomes what `isolated` says, see `join_pieces`; `attach` marks the particles
+    beside static Gaussians. `cameras` of the photographs say where the surface is (`seen.py`); with none it is a
+    deviation outside the Gaussians' centres.
+    Raises ValueError if nothing moves, the lattice would be too large, or the cameras do not see the body.
     """
     if not spacing > 0:
         raise ValueError(f"fill.spacing is {spacing:g} m, must be > 0; half a cell of the simulation grid is right")

@@ -5,8 +5,8 @@ is its pictures. A camera tells of a point x at depth z, with the pixel it falls
 
     outline    (1/2 - m) / |slope of m|, m the share of the pixel that is the body's: where m < 1/2, x is not the body's
                unless something static hides it
-    depth      d - z where m >= 1/2 and z < d + t: in front of what is seen there, or just behind it; d is the depth of
-               the Gaussian at which half the light is gone, less twice its deviation along the ray
+    depth      d - z where z < d + t: in front of what is seen there, or just behind it; d is the depth of the Gaussian
+               at which half the light is gone, if that is the body's, less twice its deviation along the ray
 
 Outlines exclude: the distance is the largest but for a tenth of the cameras, so that a few mistaken masks carve
 nothing. Depths are uncertain: the distance is their mean, cut off at the truncation t (Curless and Levoy 1996). The
@@ -41,6 +41,7 @@ GROUND = 0.5  # how far around the body static Gaussians are looked at, of its s
 LEAST_GROUND = 100  # of them
 DOUBT = 0.5  # slope that the ground may have where nothing shows it
 FAR = 1e6  # depth where nothing is seen [m]
+Depth = Callable[[np.ndarray], np.ndarray]  # of points [m, 3] [m] -> [m] [m]
 
 
 @dataclass(frozen=True)
@@ -153,12 +154,8 @@ def seen(
 class Ground:
     """What the body stands on or leans against: a surface closed under the body."""
 
-    behind: Callable[
-        [np.ndarray], np.ndarray
-    ]  # how deep [m] points [m, 3] lie, along the normal of the nearest triangle
-    doubt: Callable[
-        [np.ndarray], np.ndarray
-    ]  # by how much that may be wrong [m]: a share of the way to where it is seen
+    behind: Depth  # how deep points lie, along the normal of the nearest triangle
+    doubt: Depth  # by how much that may be wrong: a share of the way to where the ground is seen
     hidden: np.ndarray  # [k, 3] points of it that no camera sees [m]
     normal: np.ndarray  # [k, 3] there, out of the ground
 
