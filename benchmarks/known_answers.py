@@ -19,18 +19,18 @@ from torch import Tensor
 from physics3d.gaussians.deform import carry, embed
 from physics3d.gaussians.model import Gaussians
 from physics3d.log import Log
-from physics3d.mpm.boundaries.base import AbstractBoundary, Setting, inside_box
-from physics3d.mpm.boundaries.bounding_box import BoundingBox
-from physics3d.mpm.boundaries.fixed_region import FixedRegion
-from physics3d.mpm.boundaries.half_space import HalfSpace
-from physics3d.mpm.materials.drucker_prager import DruckerPrager
-from physics3d.mpm.materials.neo_hookean import NeoHookean
-from physics3d.mpm.materials.newtonian import Newtonian
-from physics3d.mpm.materials.viscoelastic import Viscoelastic
-from physics3d.mpm.materials.von_mises import VonMises
+from physics3d.boundaries.base import AbstractBoundary, Setting, inside_box
+from physics3d.boundaries.bounding_box import BoundingBox
+from physics3d.boundaries.fixed_region import FixedRegion
+from physics3d.boundaries.half_space import HalfSpace
+from physics3d.materials.drucker_prager import DruckerPrager
+from physics3d.materials.neo_hookean import NeoHookean
+from physics3d.materials.newtonian import Newtonian
+from physics3d.materials.viscoelastic import Viscoelastic
+from physics3d.materials.von_mises import VonMises
 from physics3d.mpm.rollout import Trajectory, rollout
-from physics3d.mpm.transfer import matrix, vector
-from physics3d.mpm.world import World
+from physics3d.warp_types import matrix, vector
+from physics3d.world import World
 
 DENSITY = 1000.0  # [kg/m^3], where a problem does not say otherwise
 # of the two bars: lam + 2 mu = M_E [Pa], branch moduli [Pa] and rates [1/s]

@@ -22,8 +22,8 @@ import torch
 from known_answers import K_N, M_E, MU_N, PROBLEMS, Answer
 from machine import machine
 
-from physics3d.mpm.driver import simple_shear
-from physics3d.mpm.materials.viscoelastic import Viscoelastic
+from physics3d.materials.driver import simple_shear
+from physics3d.materials.viscoelastic import Viscoelastic
 
 RESULTS = Path(__file__).resolve().parent.parent / "docs" / "results"
 PRECISIONS = ("float32", "float64")

@@ -30,10 +30,10 @@ from machine import machine
 from physics3d.gaussians.cameras import Camera, look_at
 from physics3d.gaussians.rasterize import rasterize
 from physics3d.log import Log
-from physics3d.mpm.materials.neo_hookean import NeoHookean
-from physics3d.mpm.materials.viscoelastic import Viscoelastic
+from physics3d.materials.neo_hookean import NeoHookean
+from physics3d.materials.viscoelastic import Viscoelastic
 from physics3d.mpm.rollout import rollout
-from physics3d.mpm.world import World
+from physics3d.world import World
 
 RESULTS = Path(__file__).resolve().parent.parent / "docs" / "results"
 MATERIALS = {

@@ -33,24 +33,24 @@ import warp as wp
 from machine import machine
 
 from physics3d.log import Log
-from physics3d.mpm.boundaries.bounding_box import BoundingBox
-from physics3d.mpm.boundaries.half_space import HalfSpace
-from physics3d.mpm.boundaries.impulse import Impulse
-from physics3d.mpm.boundaries.mesh_collider import MeshCollider
-from physics3d.mpm.boundaries.moving_cuboid import MovingCuboid
-from physics3d.mpm.driver import prescribed
-from physics3d.mpm.materials.drucker_prager import DruckerPrager
-from physics3d.mpm.materials.herschel_bulkley import HerschelBulkley
-from physics3d.mpm.materials.mixture import PART, Mixture
-from physics3d.mpm.materials.neo_hookean import NeoHookean
-from physics3d.mpm.materials.newtonian import Newtonian
-from physics3d.mpm.materials.snow import Snow
-from physics3d.mpm.materials.viscoelastic import Viscoelastic
-from physics3d.mpm.materials.von_mises import VonMises
-from physics3d.mpm.materials.with_branches import WithBranches
+from physics3d.boundaries.bounding_box import BoundingBox
+from physics3d.boundaries.half_space import HalfSpace
+from physics3d.boundaries.impulse import Impulse
+from physics3d.boundaries.mesh_collider import MeshCollider
+from physics3d.boundaries.moving_cuboid import MovingCuboid
+from physics3d.materials.driver import prescribed
+from physics3d.materials.drucker_prager import DruckerPrager
+from physics3d.materials.herschel_bulkley import HerschelBulkley
+from physics3d.materials.mixture import PART, Mixture
+from physics3d.materials.neo_hookean import NeoHookean
+from physics3d.materials.newtonian import Newtonian
+from physics3d.materials.snow import Snow
+from physics3d.materials.viscoelastic import Viscoelastic
+from physics3d.materials.von_mises import VonMises
+from physics3d.materials.with_branches import WithBranches
 from physics3d.mpm.rollout import rollout
 from physics3d.mpm.transfer import velocity_gradient
-from physics3d.mpm.world import World
+from physics3d.world import World
 
 RESULTS = Path(__file__).resolve().parent.parent / "docs" / "results"
 YOUNG = tuple(10.0**k for k in range(2, 11))  # [Pa]

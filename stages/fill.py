@@ -4,7 +4,7 @@ from dataclasses import dataclass, field, replace
 
 import torch
 
-from physics3d.filling import AbstractSolid, Body, Poisson, fill
+from physics3d.filling.fill import AbstractSolid, Body, Poisson, fill
 from physics3d.gaussians.model import Gaussians
 from physics3d.log import Log
 from physics3d.scenes.base import Capture

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from physics3d.log import Log
-from physics3d.mpm.world import Estimate, World
+from physics3d.world import Estimate, World
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,14 +8,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from physics3d.filling import Body
+from physics3d.filling.fill import Body
 from physics3d.gaussians.deform import Backdrop, render_deformed
 from physics3d.gaussians.model import Gaussians
 from physics3d.learning.fields import GlobalField
 from physics3d.learning.fit import Chain, fit, physical, polish, search, sensitivity
 from physics3d.log import Log
 from physics3d.mpm.rollout import rollout
-from physics3d.mpm.world import Estimate, World
+from physics3d.world import Estimate, World
 from physics3d.priors.base import AbstractPrior
 from physics3d.scenes.base import Capture, Take
 from physics3d.video import contact_sheet, to_uint8

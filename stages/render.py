@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import torch
 
-from physics3d.filling import Body
+from physics3d.filling.fill import Body
 from physics3d.gaussians.cameras import Camera
 from physics3d.gaussians.deform import Backdrop, render_deformed
 from physics3d.gaussians.interior import Interior, paint

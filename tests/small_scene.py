@@ -2,15 +2,15 @@
 
 import torch
 
-from physics3d.filling import Body
+from physics3d.filling.fill import Body
 from physics3d.gaussians.cameras import Camera, look_at
 from physics3d.gaussians.deform import embed
 from physics3d.gaussians.model import Gaussians
 from physics3d.learning.fields import GlobalField
-from physics3d.mpm.boundaries.fixed_region import FixedRegion
-from physics3d.mpm.boundaries.impulse import Impulse
-from physics3d.mpm.materials.viscoelastic import Viscoelastic
-from physics3d.mpm.world import World
+from physics3d.boundaries.fixed_region import FixedRegion
+from physics3d.boundaries.impulse import Impulse
+from physics3d.materials.viscoelastic import Viscoelastic
+from physics3d.world import World
 from physics3d.priors.exemplar import Exemplar
 from physics3d.scenes.base import Capture, Take
 from stages.learn import Learn

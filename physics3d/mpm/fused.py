@@ -10,7 +10,8 @@ from functools import cache
 import warp as wp
 
 from physics3d.mpm import columns
-from physics3d.mpm.transfer import matrix, stencil, vector, vector4
+from physics3d.mpm.transfer import stencil
+from physics3d.warp_types import matrix, vector, vector4
 
 Hook = tuple[wp.Function, int, int, int]  # function, first parameter, first signal, row of the selection
 

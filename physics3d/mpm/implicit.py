@@ -35,7 +35,8 @@ from torch import Tensor
 
 from physics3d.mpm import transfer
 from physics3d.mpm.substep import Substeps
-from physics3d.mpm.transfer import matrix, stencil, vector, vector4
+from physics3d.mpm.transfer import stencil
+from physics3d.warp_types import matrix, vector, vector4
 
 NEWTON = 30  # iterations
 SOLVER = 2000  # products with K in one linear solve

@@ -32,14 +32,14 @@ from torch import Tensor
 
 from physics3d.artifact import AbstractArtifact, require_finite
 from physics3d.log import Log
-from physics3d.mpm import spectral
-from physics3d.mpm.boundaries.base import AbstractBoundary, Setting, Vector, mirror_nodes
+from physics3d.materials import spectral
+from physics3d.boundaries.base import AbstractBoundary, Setting, Vector, mirror_nodes
 from physics3d.mpm.checkpoints import Checkpoints
 from physics3d.mpm.implicit import ImplicitSubsteps, NotConverged
 from physics3d.mpm.substep import Hook, Substeps, start_warp
 from physics3d.mpm.survey import Survey, survey
 from physics3d.mpm.transfer import velocity_gradient
-from physics3d.mpm.world import World
+from physics3d.world import World
 
 RUN = 32  # substeps between two looks at the particles, and between two checkpoints
 MOST_NODES = 2**27

@@ -10,7 +10,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from physics3d.mpm.transfer import matrix, vector
+from physics3d.warp_types import matrix, vector
 
 
 @dataclass(frozen=True)

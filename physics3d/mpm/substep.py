@@ -29,7 +29,7 @@ import warp as wp
 from physics3d.mpm import transfer
 from physics3d.mpm.fused import Hook, particle_pass
 from physics3d.mpm.state import State, make_state
-from physics3d.mpm.transfer import matrix, vector, vector4
+from physics3d.warp_types import matrix, vector, vector4
 
 
 @cache

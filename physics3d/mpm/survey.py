@@ -9,7 +9,7 @@ import warp as wp
 from torch import Tensor
 
 from physics3d.mpm.state import State
-from physics3d.mpm.transfer import matrix, vector
+from physics3d.warp_types import matrix, vector
 
 _FARTHEST = 2**29  # cells; beyond it a place is that far away
 

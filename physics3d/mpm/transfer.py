@@ -26,21 +26,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from physics3d.mpm import columns
-
-
-def vector(real) -> type:
-    """3-vector of `real` (wp.float32 or wp.float64)."""
-    return wp.vec3f if real is wp.float32 else wp.vec3d
-
-
-def vector4(real) -> type:
-    """4-vector of `real`: (momentum, mass) of a node."""
-    return wp.vec4f if real is wp.float32 else wp.vec4d
-
-
-def matrix(real) -> type:
-    """3x3 matrix of `real`."""
-    return wp.mat33f if real is wp.float32 else wp.mat33d
+from physics3d.warp_types import matrix, vector, vector4
 
 
 @cache

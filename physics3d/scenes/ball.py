@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from physics3d.mpm.boundaries.half_space import HalfSpace
-from physics3d.mpm.boundaries.impulse import Impulse
-from physics3d.mpm.materials.viscoelastic import Viscoelastic
-from physics3d.mpm.world import World
+from physics3d.boundaries.half_space import HalfSpace
+from physics3d.boundaries.impulse import Impulse
+from physics3d.materials.viscoelastic import Viscoelastic
+from physics3d.world import World
 from physics3d.scenes.base import AbstractSource, Capture
 from physics3d.scenes.photographs import held_out, triple
 from physics3d.scenes.studio import Light, Mesh, Studio, photographs, ring, surface_grid, to_linear

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from physics3d.gaussians.cameras import Camera
-from physics3d.mpm.boundaries.fixed_region import FixedRegion
-from physics3d.mpm.boundaries.impulse import Impulse
-from physics3d.mpm.materials.viscoelastic import Viscoelastic
-from physics3d.mpm.world import World
+from physics3d.boundaries.fixed_region import FixedRegion
+from physics3d.boundaries.impulse import Impulse
+from physics3d.materials.viscoelastic import Viscoelastic
+from physics3d.world import World
 from physics3d.scenes.base import AbstractSource, Capture
 from physics3d.scenes.flower import SOIL, blossom_centre, plant, surroundings
 from physics3d.scenes.photographs import held_out, triple

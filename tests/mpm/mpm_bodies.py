@@ -6,22 +6,22 @@ import pkgutil
 
 import torch
 
-from physics3d.mpm import boundaries, materials
-from physics3d.mpm.boundaries.base import AbstractBoundary
-from physics3d.mpm.boundaries.bounding_box import BoundingBox
-from physics3d.mpm.boundaries.enforced_rotation import EnforcedRotation
-from physics3d.mpm.boundaries.enforced_translation import EnforcedTranslation
-from physics3d.mpm.boundaries.fixed_region import FixedRegion
-from physics3d.mpm.boundaries.half_space import HalfSpace
-from physics3d.mpm.boundaries.held_particles import HeldParticles
-from physics3d.mpm.boundaries.impulse import Impulse
-from physics3d.mpm.boundaries.mesh_collider import MeshCollider
-from physics3d.mpm.boundaries.moving_cuboid import MovingCuboid
-from physics3d.mpm.boundaries.sequential_release import SequentialRelease
-from physics3d.mpm.materials.base import AbstractMaterial
-from physics3d.mpm.materials.mixture import Mixture
-from physics3d.mpm.materials.neo_hookean import NeoHookean
-from physics3d.mpm.world import World
+from physics3d import boundaries, materials
+from physics3d.boundaries.base import AbstractBoundary
+from physics3d.boundaries.bounding_box import BoundingBox
+from physics3d.boundaries.enforced_rotation import EnforcedRotation
+from physics3d.boundaries.enforced_translation import EnforcedTranslation
+from physics3d.boundaries.fixed_region import FixedRegion
+from physics3d.boundaries.half_space import HalfSpace
+from physics3d.boundaries.held_particles import HeldParticles
+from physics3d.boundaries.impulse import Impulse
+from physics3d.boundaries.mesh_collider import MeshCollider
+from physics3d.boundaries.moving_cuboid import MovingCuboid
+from physics3d.boundaries.sequential_release import SequentialRelease
+from physics3d.materials.base import AbstractMaterial
+from physics3d.materials.mixture import Mixture
+from physics3d.materials.neo_hookean import NeoHookean
+from physics3d.world import World
 
 
 def block(cells: tuple[int, int, int], dx: float, per_cell: int = 2, lower=(0.0, 0.0, 0.0)):

@@ -5,10 +5,10 @@ import pytest
 import torch
 from mpm_bodies import block, every_material, tensors
 
-from physics3d.mpm.boundaries.base import Setting
-from physics3d.mpm.boundaries.enforced_rotation import EnforcedRotation
-from physics3d.mpm.boundaries.impulse import Impulse
-from physics3d.mpm.materials.viscoelastic import Viscoelastic
+from physics3d.boundaries.base import Setting
+from physics3d.boundaries.enforced_rotation import EnforcedRotation
+from physics3d.boundaries.impulse import Impulse
+from physics3d.materials.viscoelastic import Viscoelastic
 from physics3d.mpm.substep import Substeps, start_warp
 
 DX, STEPS = 0.1, 5

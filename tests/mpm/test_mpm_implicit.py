@@ -9,14 +9,14 @@ import torch
 from mpm_bodies import block, every_boundary, every_material, soft_world, tensors
 
 from physics3d.log import Log
-from physics3d.mpm.boundaries.bounding_box import BoundingBox
-from physics3d.mpm.boundaries.fixed_region import FixedRegion
-from physics3d.mpm.boundaries.half_space import HalfSpace
-from physics3d.mpm.boundaries.impulse import Impulse
-from physics3d.mpm.materials.drucker_prager import DruckerPrager
-from physics3d.mpm.materials.neo_hookean import NeoHookean
-from physics3d.mpm.materials.newtonian import Newtonian
-from physics3d.mpm.materials.viscoelastic import Viscoelastic
+from physics3d.boundaries.bounding_box import BoundingBox
+from physics3d.boundaries.fixed_region import FixedRegion
+from physics3d.boundaries.half_space import HalfSpace
+from physics3d.boundaries.impulse import Impulse
+from physics3d.materials.drucker_prager import DruckerPrager
+from physics3d.materials.neo_hookean import NeoHookean
+from physics3d.materials.newtonian import Newtonian
+from physics3d.materials.viscoelastic import Viscoelastic
 from physics3d.mpm.rollout import rollout
 
 DX = 0.1

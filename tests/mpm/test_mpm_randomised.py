@@ -15,17 +15,17 @@ from hypothesis import HealthCheck, given, settings
 from mpm_bodies import block, tensors
 
 from physics3d.log import Log
-from physics3d.mpm.boundaries.base import AbstractBoundary
-from physics3d.mpm.boundaries.bounding_box import BoundingBox
-from physics3d.mpm.boundaries.half_space import HalfSpace
-from physics3d.mpm.boundaries.impulse import Impulse
-from physics3d.mpm.boundaries.mesh_collider import MeshCollider
-from physics3d.mpm.boundaries.moving_cuboid import MovingCuboid
-from physics3d.mpm.materials.drucker_prager import DruckerPrager
-from physics3d.mpm.materials.newtonian import Newtonian
-from physics3d.mpm.materials.viscoelastic import Viscoelastic
+from physics3d.boundaries.base import AbstractBoundary
+from physics3d.boundaries.bounding_box import BoundingBox
+from physics3d.boundaries.half_space import HalfSpace
+from physics3d.boundaries.impulse import Impulse
+from physics3d.boundaries.mesh_collider import MeshCollider
+from physics3d.boundaries.moving_cuboid import MovingCuboid
+from physics3d.materials.drucker_prager import DruckerPrager
+from physics3d.materials.newtonian import Newtonian
+from physics3d.materials.viscoelastic import Viscoelastic
 from physics3d.mpm.rollout import rollout
-from physics3d.mpm.world import World
+from physics3d.world import World
 
 DX = 0.04
 LOWER, UPPER = (0.0, 0.0, 0.0), (0.4, 0.4, 0.4)

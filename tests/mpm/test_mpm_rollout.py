@@ -7,13 +7,13 @@ import torch
 from mpm_bodies import block, soft_world, tensors
 
 from physics3d.log import Log
-from physics3d.mpm.boundaries.bounding_box import BoundingBox
-from physics3d.mpm.boundaries.fixed_region import FixedRegion
-from physics3d.mpm.boundaries.half_space import HalfSpace
-from physics3d.mpm.boundaries.impulse import Impulse
-from physics3d.mpm.materials.neo_hookean import NeoHookean
-from physics3d.mpm.materials.snow import Snow
-from physics3d.mpm.materials.viscoelastic import Viscoelastic
+from physics3d.boundaries.bounding_box import BoundingBox
+from physics3d.boundaries.fixed_region import FixedRegion
+from physics3d.boundaries.half_space import HalfSpace
+from physics3d.boundaries.impulse import Impulse
+from physics3d.materials.neo_hookean import NeoHookean
+from physics3d.materials.snow import Snow
+from physics3d.materials.viscoelastic import Viscoelastic
 from physics3d.mpm.rollout import rollout
 
 G = torch.tensor((0.0, 0.0, -9.81), dtype=torch.float64)

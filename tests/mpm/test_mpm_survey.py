@@ -6,7 +6,7 @@ import warp as wp
 
 from physics3d.mpm.state import make_state
 from physics3d.mpm.survey import survey
-from physics3d.mpm.transfer import vector
+from physics3d.warp_types import vector
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import torch
 import warp as wp
 
 from physics3d.mpm import transfer
+from physics3d.warp_types import matrix, vector, vector4
 from physics3d.mpm.transfer import velocity_gradient
 
 DX, DT, SIDE, N = 0.1, 1e-3, 9, 40
@@ -59,7 +60,7 @@ def scatter(p, adjoint=None, fast=False):
     """grid [node, 4], lost; or with the adjoint of the grid: adjoints of u, v, L, tau."""
     wp.init()
     real = wp.float64 if p["u"].dtype == torch.float64 else wp.float32
-    vec3, vec4, mat33 = transfer.vector(real), transfer.vector4(real), transfer.matrix(real)
+    vec3, vec4, mat33 = vector(real), vector4(real), matrix(real)
     grid, lost = wp.zeros(SIDE**3, dtype=vec4, device="cpu"), wp.zeros(1, dtype=int, device="cpu")
     clock = wp.array(np.array([[DT, 1.0]]), dtype=real, device="cpu")
     inputs = [0, DX, window(), clock, wp.zeros(1, dtype=int, device="cpu")]
@@ -79,7 +80,7 @@ def gather(p, node_velocity, adjoint=None, fast=False):
     """v [p, 3], L [p, 3, 3]; or with their adjoints: adjoints of u and of the node velocities."""
     wp.init()
     real = wp.float64
-    vec3, mat33 = transfer.vector(real), transfer.matrix(real)
+    vec3, mat33 = vector(real), matrix(real)
     inputs = [0, DX, window(), array(p["cell"], wp.vec3i), array(p["offset"], vec3), array(p["u"], vec3)]
     # the fast form reads one number too many, whatever it is
     padded = torch.cat([node_velocity, torch.full((1, 3), float("nan"), dtype=torch.float64)])
@@ -89,7 +90,7 @@ def gather(p, node_velocity, adjoint=None, fast=False):
         wp.launch(transfer.gather(real, fast), N, inputs=inputs, outputs=outputs, device="cpu")
         return [wp.to_torch(value) for value in outputs]
     offset, found_u = [wp.zeros_like(value) for value in inputs[-3:-1]]
-    found = [found_u, wp.zeros(SIDE**3, dtype=transfer.vector4(real) if fast else vec3, device="cpu")]
+    found = [found_u, wp.zeros(SIDE**3, dtype=vector4(real) if fast else vec3, device="cpu")]
     inputs += [array(adjoint[0], vec3), array(adjoint[1], mat33)]
     wp.launch(transfer.gather_adjoint(real, fast), N, inputs=inputs, outputs=[offset, *found], device="cpu")
     torch.testing.assert_close(wp.to_torch(offset), wp.to_torch(found[0]) * DX)

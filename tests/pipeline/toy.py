@@ -10,7 +10,7 @@ from physics3d.gaussians.cameras import Camera
 from physics3d.gaussians.model import Gaussians
 from physics3d.log import Log
 from physics3d.metrics.scores import Scores
-from physics3d.mpm.world import Estimate
+from physics3d.world import Estimate
 from physics3d.scenes.base import Capture, Take
 from physics3d.video import Video
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from physics3d.log import Log
-from physics3d.mpm.boundaries.impulse import Impulse
-from physics3d.mpm.materials.viscoelastic import Viscoelastic
+from physics3d.boundaries.impulse import Impulse
+from physics3d.materials.viscoelastic import Viscoelastic
 from physics3d.mpm.rollout import rollout
 from physics3d.scenes.ball import RADIUS, BallTwin
 from physics3d.scenes.base import Capture

@@ -7,7 +7,7 @@ import torch
 from small_scene import ELASTIC, bar, capture, learner
 
 from physics3d.log import Log
-from physics3d.mpm.world import Estimate
+from physics3d.world import Estimate
 
 START = ELASTIC | {"youngs_modulus": 7e3}
 

@@ -1,0 +1,99 @@
+"""Impulse: a total force on part of the body for some time; a poke, a gust, the start of every paper video.
+
+    a(t) = force / m(part)  or  acceleration,   start <= t < start + duration,   for the particles AT REST in the region
+
+The region is a ball (centre, radius), a box (lower, upper), or the so many particles `nearest` to a centre. The force
+follows the material, and the momentum it gives is force * duration exactly, whatever the substep.
+"""
+
+import functools
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+from jaxtyping import Float
+from torch import Tensor
+
+from physics3d.boundaries import base
+from physics3d.warp_types import vector
+
+
+@dataclass(frozen=True, kw_only=True)
+class Impulse(base.AbstractBoundary):
+    """Total force [N] on the particles of a region, or acceleration [m/s^2] of each, in a window of time [s].
+
+    Either may be a tensor of three, and the trajectory is differentiable with respect to it. For a momentum P [N s]
+    take force = P/duration."""
+
+    force: base.Vector | Tensor | None = None  # in total [N]
+    acceleration_of_each: base.Vector | Tensor | None = None  # [m/s^2]
+    centre: base.Vector | None = None  # [m]
+    radius: float | None = None  # [m]
+    nearest: int | None = None  # particles
+    lower: base.Vector | None = None  # corners of a box [m]
+    upper: base.Vector | None = None
+    start: float = 0.0
+    duration: float
+
+    def check(self) -> None:
+        base.require((self.force is None) != (self.acceleration_of_each is None), self, "force",
+                     "a force or an acceleration_of_each")  # fmt: skip
+        what, unit = ("force", "N") if self.force is not None else ("acceleration_of_each", "m/s^2")
+        base.require_finite(self, what)
+        base.require(len(getattr(self, what)) == 3, self, what, f"three numbers [{unit}]")
+        given = [name for name in ("radius", "nearest", "lower") if getattr(self, name) is not None]
+        base.require(
+            len(given) == 1, self, "radius", "one region: centre and radius, centre and nearest, or lower and upper"
+        )
+        base.require((self.lower is None) == (self.upper is None), self, "upper", "both corners or neither")
+        base.require((self.centre is None) == (self.upper is not None), self, "centre", "one for radius or nearest")
+        if self.lower is not None:
+            base.require_box(self)
+        else:
+            base.require_finite(self, "centre", given[0])
+            base.require(getattr(self, given[0]) > 0, self, given[0], "a radius above 0 m, or at least 1 particle")
+        base.require_window(self)
+
+    def selection(self, setting: base.Setting) -> Float[Tensor, " p"]:
+        if self.lower is not None and self.upper is not None:
+            selected = base.inside_box(setting.position, self.lower, self.upper)
+        else:
+            distance = (setting.position - setting.position.new_tensor(self.centre)).norm(dim=1)
+            if self.radius is not None:
+                selected = (distance <= self.radius).to(torch.float64)
+            else:
+                selected = torch.zeros_like(distance)
+                selected[distance.argsort(stable=True)[: self.nearest]] = 1.0
+        base.require_selected(self, selected)
+        return selected
+
+    def parameters(self, setting: base.Setting) -> Float[Tensor, "3"]:
+        if self.acceleration_of_each is not None:
+            return torch.as_tensor(self.acceleration_of_each, dtype=torch.float64).cpu()
+        mass = (self.selection(setting) * setting.mass).sum()
+        return torch.as_tensor(self.force, dtype=torch.float64).cpu() / mass
+
+    def signals(self, t: float, dt: float) -> tuple[float]:
+        return (base.overlap(self.start, self.duration, t, dt),)
+
+    def acceleration(self, real: type) -> wp.Function:
+        return _acceleration(real)
+
+
+@functools.cache
+def _acceleration(real: type) -> wp.Function:
+    vec3 = vector(real)
+
+    @wp.func(name=f"impulse_{real.__name__}")
+    def acceleration(
+        weight: real,
+        x: vec3,
+        q: wp.array(dtype=real),
+        a: int,
+        clock: wp.array2d(dtype=real),
+        row: int,
+        b: int,
+    ):
+        return (weight * clock[row, b]) * vec3(q[a], q[a + 1], q[a + 2])
+
+    return acceleration

@@ -1,0 +1,94 @@
+"""Weakly compressible fluid, Newtonian or power-law: water, honey, ketchup above its yield.
+
+    tau = K J (J - 1) I + 2 eta J dev D,   D = sym L                                [Pa]
+    eta = k g^(n - 1),   g^2 = 2 dev D : dev D + g_0^2,   g_0 = 1e-3 1/s            n = 1: Newtonian, eta = k
+
+J is integrated by itself, (J - 1)_next from det(I + dt L): the determinant of a long-sheared F would lose it. A viscous
+explicit step needs dt < rho dx^2 / (6 eta) besides the sound-speed limit. Bird, Armstrong, Hassager (1987), sec. 4.1.
+"""
+
+import functools
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+from jaxtyping import Float
+from torch import Tensor
+
+from physics3d.materials import spectral
+from physics3d.materials import base
+
+_LEAST_RATE = 1e-3  # g_0 [1/s]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Newtonian(base.AbstractMaterial):
+    """Parameters: bulk_modulus [Pa], viscosity k [Pa s^n], power_index n."""
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        return ("bulk_modulus", "viscosity", "power_index")
+
+    @property
+    def example(self) -> dict[str, float]:
+        return {"bulk_modulus": 1e5, "viscosity": 5.0, "power_index": 1.0}  # honey, softened
+
+    @property
+    def memory_rows(self) -> int:
+        return 1
+
+    def check_parameters(self, values: base.Values) -> None:
+        base.check_names(values, self.parameters)
+        base.check_range(values, "bulk_modulus", 0.0)
+        base.check_range(values, "viscosity", 0.0, closed=True)
+        base.check_range(values, "power_index", 0.0, 2.0, closed=True)
+
+    def coefficients(self, values: base.Values) -> Float[Tensor, "3 n"]:
+        self.check_parameters(values)
+        return base.rows(*(values[name] for name in self.parameters))
+
+    def wave_modulus(self, coefficients: Float[Tensor, "3 n"]) -> Float[Tensor, " n"]:
+        return coefficients[0]
+
+    def viscosity(self, coefficients: Float[Tensor, "3 n"], L: Float[Tensor, "n 3 3"]) -> Float[Tensor, " n"]:
+        D = (L + L.mT) / 2
+        dev = D - D.diagonal(dim1=1, dim2=2).mean(1)[:, None, None] * torch.eye(3, dtype=L.dtype, device=L.device)
+        _, k, n = coefficients
+        return k * (2 * (dev * dev).sum((1, 2)) + _LEAST_RATE**2) ** ((n - 1) / 2)
+
+    def energy(
+        self, coefficients: Float[Tensor, "3 n"], H: Float[Tensor, "n 3 3"], memory: Float[Tensor, "1 n"]
+    ) -> Float[Tensor, " n"]:
+        return coefficients[0] / 2 * memory[0] ** 2
+
+    def advance(self, real: type) -> wp.Function:
+        return _advance(real)
+
+
+@functools.cache
+def _advance(real: type) -> wp.Function:
+    mat33 = spectral.matrix_type(real)
+    volume_change = spectral.volume_change(real)
+    least2 = real(_LEAST_RATE**2)
+
+    @wp.func(name=f"newtonian_{real.__name__}")
+    def advance(
+        p: int,
+        dt: real,  # [s]
+        L: mat33,  # velocity gradient [1/s]
+        H: mat33,  # F - I
+        coefficients: wp.array2d(dtype=real),  # K [Pa], k [Pa s^n], n
+        memory: wp.array2d(dtype=real),  # J - 1
+        memory_next: wp.array2d(dtype=real),
+    ):
+        one = wp.identity(n=3, dtype=real)
+        M = dt * L
+        j = memory[0, p] + (real(1.0) + memory[0, p]) * volume_change(M)
+        memory_next[0, p] = j
+        J = real(1.0) + j
+        D = real(0.5) * (L + wp.transpose(L)) - wp.trace(L) / real(3.0) * one
+        g2 = real(2.0) * wp.ddot(D, D) + least2
+        eta = coefficients[1, p] * wp.pow(g2, real(0.5) * (coefficients[2, p] - real(1.0)))
+        return H + M + M * H, coefficients[0, p] * J * j * one + real(2.0) * eta * wp.max(J, real(0.0)) * D
+
+    return spectral.without_replay(advance)

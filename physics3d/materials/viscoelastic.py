@@ -1,0 +1,249 @@
+"""Viscoelastic solid of the paper: an elastic branch and 0 to 3 Maxwell branches in parallel, same total deformation.
+
+    tau   = tau_E + sum_N tau_N                                                     [Pa], Kirchhoff
+    psi_E = mu sum_i (s_i - 1)^2 + lam/2 (J - 1)^2                                  fixed corotated, F = V R
+    tau_E = 2 mu (V^2 - V) + lam J (J - 1) I
+    tau_N = 2 mu_N eps + lam_N tr(eps) I,   eps = 1/2 ln b_N                        Hencky spring
+    d(dev eps)/dt = -k_d dev eps,   d(tr eps)/dt = -k_v tr eps                      dash-pot, [1/s]
+
+One substep of a branch (Strang): b_N is carried by the flow, the stress is taken from the half-relaxed strain, the
+fully relaxed strain is stored as X = b_N - I. Second order in dt, stable for every dt k; the stored strain is half a
+step ahead.
+
+`spring="neo_hookean"` replaces the Hencky spring, whose shear stress falls beyond a shear of 3, by
+tau_N = mu_N dev(b~) + K_N ln J_N I, b~ = J_N^(-2/3) b_N, with d eps/dt = -(k_d/2) dev(b~) (Reese and Govindjee 1998).
+Along that flow b~^-1 stays on the ray b~_0^-1 + s I scaled to determinant one, ds/dt = k_d det(b~_0^-1 + s I)^(1/3); s
+is taken from its expansion s = (exp(m k_d t) - 1)/m, m = tr(b~_0)/3: no eigendecomposition, the same order.
+
+Liu et al. (arXiv 2406.04338); where and why we depart from it: docs/method.md.
+"""
+
+import functools
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+import warp as wp
+from jaxtyping import Float
+from torch import Tensor
+
+from physics3d.materials import spectral
+from physics3d.materials import base
+
+
+@dataclass(frozen=True, kw_only=True)
+class Viscoelastic(base.AbstractMaterial):
+    """Parameters: youngs_modulus [Pa], poissons_ratio, and for every branch branch_shear_modulus (mu_N),
+    branch_bulk_modulus (K_N) [Pa], shear_viscosity_time (1/k_d), bulk_viscosity_time (1/k_v) [s, inf: never relaxes];
+    those of further branches end in _2, _3.
+
+    Raises ValueError for a number of branches outside 0..3, an unknown spring, or nothing at all.
+    """
+
+    branches: int = 1
+    elastic: bool = True  # the branch that never relaxes
+    spring: Literal["hencky", "neo_hookean"] = "hencky"
+
+    def __post_init__(self) -> None:
+        if self.branches not in (0, 1, 2, 3):
+            raise ValueError(f"branches is {self.branches}; take 0, 1, 2 or 3")
+        if self.spring not in _MAXWELL:
+            raise ValueError(f"spring is {self.spring!r}; take one of {sorted(_MAXWELL)}")
+        if not self.elastic and not self.branches:
+            raise ValueError(
+                "elastic is False and branches is 0: no stress is defined; take branches >= 1 or elastic=True"
+            )
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        names = ("youngs_modulus", "poissons_ratio") if self.elastic else ()
+        return names + tuple(name + suffix for suffix in self._suffixes for name in _BRANCH)
+
+    @property
+    def example(self) -> dict[str, float]:
+        found = {"youngs_modulus": 1e5, "poissons_ratio": 0.3} if self.elastic else {}  # soft tissue
+        for i, suffix in enumerate(self._suffixes):
+            found |= dict(zip((name + suffix for name in _BRANCH), (4e4, 8e4, 0.2 / 4**i, 0.5 / 4**i), strict=True))
+        return found
+
+    @property
+    def _suffixes(self) -> tuple[str, ...]:
+        return ("", "_2", "_3")[: self.branches]
+
+    @property
+    def memory_rows(self) -> int:
+        return 6 * self.branches
+
+    def check_parameters(self, values: base.Values) -> None:
+        base.check_names(values, self.parameters)
+        if self.elastic:
+            base.check_elastic(values)
+        for suffix in self._suffixes:
+            for name in ("branch_shear_modulus", "branch_bulk_modulus"):
+                base.check_range(values, name + suffix, 0.0)
+            for name in ("shear_viscosity_time", "bulk_viscosity_time"):
+                base.check_range(values, name + suffix, 1e-30, closed=True)
+
+    def coefficients(self, values: base.Values) -> Float[Tensor, "k n"]:
+        self.check_parameters(values)
+        found = list(base.lame(values["youngs_modulus"], values["poissons_ratio"])) if self.elastic else []
+        for suffix in self._suffixes:
+            mu, K, shear_time, bulk_time = (values[name + suffix] for name in _BRANCH)
+            found += [mu, K, 1 / shear_time, 1 / bulk_time]
+        return base.rows(*found)
+
+    def wave_modulus(self, coefficients: Float[Tensor, "k n"]) -> Float[Tensor, " n"]:
+        total = torch.zeros_like(coefficients[0])
+        if self.elastic:
+            total = total + coefficients[1] + 2 * coefficients[0]
+        for i in range(self.branches):
+            mu, K = coefficients[self._first(i) : self._first(i) + 2]
+            total = total + K + 4 / 3 * mu
+        return total
+
+    def _first(self, branch: int) -> int:
+        """Row of the first coefficient of a branch."""
+        return (2 if self.elastic else 0) + 4 * branch
+
+    def energy(
+        self, coefficients: Float[Tensor, "k n"], H: Float[Tensor, "n 3 3"], memory: Float[Tensor, "m n"]
+    ) -> Float[Tensor, " n"]:
+        one = torch.eye(3, dtype=H.dtype, device=H.device)
+        psi = torch.zeros_like(H[:, 0, 0])
+        if self.elastic:
+            mu, lam = coefficients[:2]
+            J = spectral.determinant(one + H)
+            psi = psi + mu * spectral.stretch_distance(H) + lam / 2 * (J - 1) ** 2
+        for i in range(self.branches):
+            mu, K = coefficients[self._first(i) : self._first(i) + 2]
+            strain = memory[6 * i : 6 * i + 6]
+            if self.spring == "hencky":
+                psi = psi + base.hencky_energy(mu, K, strain)
+            else:
+                dev, log_J = base.log_strain(strain)
+                psi = psi + mu / 2 * torch.expm1(2 * dev).sum(1) + K / 2 * log_J**2
+        return psi
+
+    def advance(self, real: type) -> wp.Function:
+        return _advance(self.branches, self.elastic, self.spring, real)
+
+
+_BRANCH = ("branch_shear_modulus", "branch_bulk_modulus", "shear_viscosity_time", "bulk_viscosity_time")
+
+
+@functools.cache
+def _neo_hookean(real: type) -> wp.Function:
+    """As `spectral.maxwell_hencky`. b~ = I + B, b~^-1 = I + W; W/(1 + s) is W relaxed before it is scaled to
+    determinant one."""
+    mat33 = spectral.matrix_type(real)
+    log_det, expm1 = spectral.log_det(real), spectral.expm1(real)
+    unimodular_inverse = spectral.unimodular_inverse(real)
+
+    @wp.func(name=f"maxwell_neo_hookean_{real.__name__}")
+    def maxwell(X: mat33, mu: real, K: real, d: real, v: real):
+        one = wp.identity(n=3, dtype=real)
+        log_J = real(0.5) * log_det(X)
+        W = unimodular_inverse(X)
+        m = wp.max(real(1.0) + wp.trace(unimodular_inverse(W)) / real(3.0), real(1.0))
+        half = unimodular_inverse(W / (real(1.0) + expm1(wp.min(real(0.5) * m * d, real(60.0))) / m))
+        full = unimodular_inverse(W / (real(1.0) + expm1(wp.min(m * d, real(60.0))) / m))
+        tau = mu * (half - wp.trace(half) / real(3.0) * one) + K * wp.exp(-real(0.5) * v) * log_J * one
+        g = expm1(real(2.0) / real(3.0) * wp.exp(-v) * log_J)
+        return tau, (real(1.0) + g) * full + g * one
+
+    return maxwell
+
+
+_MAXWELL = {"hencky": spectral.maxwell_hencky, "neo_hookean": _neo_hookean}
+
+
+@functools.cache
+def _corotated(real: type) -> wp.Function:
+    """corotated(H, mu, lam) -> stress of the elastic branch."""
+    mat33 = spectral.matrix_type(real)
+    volume_change, cofactor = spectral.volume_change(real), spectral.cofactor(real)
+    stretch, adjoint_of_stretch = spectral.stretch(real), spectral.adjoint_of_stretch(real)
+
+    @wp.func(name=f"corotated_{real.__name__}")
+    def corotated(H: mat33, mu: real, lam: real):
+        Y = stretch(H)
+        j = volume_change(H)
+        return real(2.0) * mu * (Y + Y * Y) + lam * (real(1.0) + j) * j * wp.identity(n=3, dtype=real)
+
+    @wp.func_grad(corotated)
+    def adj_corotated(H: mat33, mu: real, lam: real, adj_ret: mat33):
+        one = wp.identity(n=3, dtype=real)
+        Y = stretch(H)
+        j = volume_change(H)
+        A = real(0.5) * (adj_ret + wp.transpose(adj_ret))
+        AY = A * Y
+        trace = wp.trace(A)
+        F = one + H
+        adj_Y = real(2.0) * mu * (A + AY + wp.transpose(AY))
+        wp.adjoint[H] += adjoint_of_stretch(F, one + Y, adj_Y) + lam * (real(1.0) + real(2.0) * j) * trace * cofactor(F)
+        wp.adjoint[mu] += real(2.0) * (wp.trace(AY) + wp.ddot(AY, Y))
+        wp.adjoint[lam] += (real(1.0) + j) * j * trace
+
+    return spectral.without_replay(corotated)
+
+
+@functools.cache
+def maxwell_branches(branches: int, spring: str, real: type) -> wp.Function:
+    """all(p, dt, M, first, row, coefficients, memory, memory_next) -> stress of the branches, carried by I + M and
+    relaxed over dt; their coefficients begin at row `first`, their memory at `row`."""
+    mat33 = spectral.matrix_type(real)
+    maxwell = _MAXWELL[spring](real)
+    carried, store = base.carried_strain(real), base.store_strain(real)
+
+    @wp.func(name=f"maxwell_branches_{branches}_{spring}_{real.__name__}")
+    def all_branches(
+        p: int,
+        dt: real,  # [s]
+        M: mat33,
+        first: int,
+        row: int,
+        coefficients: wp.array2d(dtype=real),  # from `first`: mu_N, K_N [Pa], k_d, k_v [1/s] of each branch
+        memory: wp.array2d(dtype=real),  # from `row`: upper triangle of b_N - I of each branch
+        memory_next: wp.array2d(dtype=real),
+    ):
+        tau = mat33()
+        for i in range(wp.static(branches)):
+            k = first + 4 * i
+            d, v = dt * coefficients[k + 2, p], dt * coefficients[k + 3, p]
+            X_trial = carried(p, row + 6 * i, M, memory)
+            tau_N, X = maxwell(X_trial, coefficients[k, p], coefficients[k + 1, p], d, v)
+            store(p, row + 6 * i, X, memory_next)
+            tau = tau + tau_N
+        return tau
+
+    return spectral.without_replay(all_branches)
+
+
+@functools.cache
+def _advance(branches: int, elastic: bool, spring: str, real: type) -> wp.Function:
+    mat33 = spectral.matrix_type(real)
+    corotated = _corotated(real)
+    all_branches = maxwell_branches(branches, spring, real)
+    key = f"{branches}_{'elastic' if elastic else 'viscous'}_{spring}_{real.__name__}"
+    first = 2 if elastic else 0
+
+    @wp.func(name=f"viscoelastic_{key}")
+    def advance(
+        p: int,
+        dt: real,  # [s]
+        L: mat33,  # velocity gradient [1/s]
+        H: mat33,  # F - I
+        coefficients: wp.array2d(dtype=real),  # mu, lam [Pa], then mu_N, K_N [Pa], k_d, k_v [1/s] of each branch
+        memory: wp.array2d(dtype=real),  # upper triangle of b_N - I of each branch
+        memory_next: wp.array2d(dtype=real),
+    ):
+        M = dt * L
+        H_next = H + M + M * H
+        tau = mat33()
+        if wp.static(elastic):
+            tau = tau + corotated(H_next, coefficients[0, p], coefficients[1, p])
+        if wp.static(branches):
+            tau = tau + all_branches(p, dt, M, first, 0, coefficients, memory, memory_next)
+        return H_next, tau
+
+    return spectral.without_replay(advance)
