@@ -27,6 +27,9 @@ sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parents[1] / 
 from analytic_bodies import discs, sphere
 
 from benchmarks.machine import machine
+from physics3d.boundaries.base import AbstractBoundary
+from physics3d.boundaries.fixed_region import FixedRegion
+from physics3d.boundaries.impulse import Impulse
 from physics3d.filling.fill import Poisson, fill
 from physics3d.gaussians.cameras import Camera, look_at
 from physics3d.gaussians.deform import Embedding, carry, embed, render_deformed
@@ -36,9 +39,6 @@ from physics3d.gaussians.rasterize import rasterize
 from physics3d.gaussians.render import render
 from physics3d.gaussians.sh import C0, sh_color
 from physics3d.log import Log
-from physics3d.boundaries.base import AbstractBoundary
-from physics3d.boundaries.fixed_region import FixedRegion
-from physics3d.boundaries.impulse import Impulse
 from physics3d.materials.neo_hookean import NeoHookean
 from physics3d.mpm.rollout import Trajectory, rollout
 from physics3d.world import World

@@ -10,8 +10,8 @@ a voxel of the surface.
 
 These Gaussians lie where the surface is. Those of a fit do not: the last part reconstructs the carnation from its 40
 photographs and fills it, without asking the photographs' cameras (the surface is then a deviation outside the
-Gaussians' centres) and asking them (physics3d/filling/seen.py). Measured is its stem, without the leaves; labels are those of
-the nearest mesh. A stem bends with its second moment of area, which goes with the fourth power of the radius.
+Gaussians' centres) and asking them (physics3d/filling/seen.py). Measured is its stem, without the leaves; labels are
+those of the nearest mesh. A stem bends with its second moment of area, which goes with the fourth power of the radius.
 """
 
 import csv

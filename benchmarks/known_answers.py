@@ -16,13 +16,13 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from physics3d.gaussians.deform import carry, embed
-from physics3d.gaussians.model import Gaussians
-from physics3d.log import Log
 from physics3d.boundaries.base import AbstractBoundary, Setting, inside_box
 from physics3d.boundaries.bounding_box import BoundingBox
 from physics3d.boundaries.fixed_region import FixedRegion
 from physics3d.boundaries.half_space import HalfSpace
+from physics3d.gaussians.deform import carry, embed
+from physics3d.gaussians.model import Gaussians
+from physics3d.log import Log
 from physics3d.materials.drucker_prager import DruckerPrager
 from physics3d.materials.neo_hookean import NeoHookean
 from physics3d.materials.newtonian import Newtonian

@@ -32,12 +32,12 @@ import torch
 import warp as wp
 from machine import machine
 
-from physics3d.log import Log
 from physics3d.boundaries.bounding_box import BoundingBox
 from physics3d.boundaries.half_space import HalfSpace
 from physics3d.boundaries.impulse import Impulse
 from physics3d.boundaries.mesh_collider import MeshCollider
 from physics3d.boundaries.moving_cuboid import MovingCuboid
+from physics3d.log import Log
 from physics3d.materials.driver import prescribed
 from physics3d.materials.drucker_prager import DruckerPrager
 from physics3d.materials.herschel_bulkley import HerschelBulkley

@@ -9,15 +9,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from physics3d.boundaries.base import AbstractBoundary
 from physics3d.log import Log
 from physics3d.metrics.image import ms_ssim, psnr, ssim
 from physics3d.metrics.motion import flow, flow_error, motion_psnr, moving, oscillation, signal
 from physics3d.metrics.scores import Scores
 from physics3d.metrics.video import vmaf
-from physics3d.boundaries.base import AbstractBoundary
-from physics3d.world import Estimate
 from physics3d.scenes.base import Capture, Take
 from physics3d.video import Video, contact_sheet, space_time_slice, write_mp4
+from physics3d.world import Estimate
 from stages.simulate import excited
 
 FROZEN, REFERENCE = "frozen first frame", "reference"

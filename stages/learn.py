@@ -15,10 +15,10 @@ from physics3d.learning.fields import GlobalField
 from physics3d.learning.fit import Chain, fit, physical, polish, search, sensitivity
 from physics3d.log import Log
 from physics3d.mpm.rollout import rollout
-from physics3d.world import Estimate, World
 from physics3d.priors.base import AbstractPrior
 from physics3d.scenes.base import Capture, Take
 from physics3d.video import contact_sheet, to_uint8
+from physics3d.world import Estimate, World
 
 
 @dataclass(frozen=True, kw_only=True)

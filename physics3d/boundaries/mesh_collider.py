@@ -38,8 +38,8 @@ from torch import Tensor
 
 from physics3d.boundaries import base
 from physics3d.boundaries.half_space import KINDS, coulomb
-from physics3d.warp_types import matrix, vector, vector4
 from physics3d.open3d_import import open3d
+from physics3d.warp_types import matrix, vector, vector4
 
 SUFFIXES = (".obj", ".ply", ".stl")
 MOST_SAMPLES = 2**22

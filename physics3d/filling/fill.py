@@ -28,15 +28,15 @@ from scipy.spatial import Delaunay, QhullError, cKDTree
 from torch import Tensor
 
 from physics3d.artifact import AbstractArtifact, require_finite
+from physics3d.boundaries.base import AbstractBoundary
+from physics3d.boundaries.fixed_region import FixedRegion
+from physics3d.boundaries.held_particles import HeldParticles
+from physics3d.filling.seen import Ground, Seen, ground, seen
 from physics3d.gaussians.cameras import Camera
 from physics3d.gaussians.deform import Embedding, embed
 from physics3d.gaussians.model import Gaussians
 from physics3d.log import Log
-from physics3d.boundaries.base import AbstractBoundary
-from physics3d.boundaries.fixed_region import FixedRegion
-from physics3d.boundaries.held_particles import HeldParticles
 from physics3d.open3d_import import open3d
-from physics3d.filling.seen import Ground, Seen, ground, seen
 
 DIRECTIONS = np.array(
     [d for d in itertools.product((-1, 0, 1), repeat=3) if any(d)]

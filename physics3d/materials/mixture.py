@@ -15,8 +15,7 @@ import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from physics3d.materials import spectral
-from physics3d.materials import base
+from physics3d.materials import base, spectral
 
 PART = "part"
 

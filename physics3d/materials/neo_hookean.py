@@ -16,8 +16,7 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
-from physics3d.materials import spectral
-from physics3d.materials import base
+from physics3d.materials import base, spectral
 
 _FLOOR = 1e-4  # J
 

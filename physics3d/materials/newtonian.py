@@ -15,8 +15,7 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
-from physics3d.materials import spectral
-from physics3d.materials import base
+from physics3d.materials import base, spectral
 
 _LEAST_RATE = 1e-3  # g_0 [1/s]
 

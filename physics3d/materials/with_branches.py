@@ -14,8 +14,7 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
-from physics3d.materials import spectral
-from physics3d.materials import base
+from physics3d.materials import base, spectral
 from physics3d.materials.neo_hookean import NeoHookean
 from physics3d.materials.viscoelastic import Viscoelastic, maxwell_branches
 

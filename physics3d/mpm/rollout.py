@@ -31,9 +31,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from physics3d.artifact import AbstractArtifact, require_finite
+from physics3d.boundaries.base import AbstractBoundary, Setting, Vector, mirror_nodes
 from physics3d.log import Log
 from physics3d.materials import spectral
-from physics3d.boundaries.base import AbstractBoundary, Setting, Vector, mirror_nodes
 from physics3d.mpm.checkpoints import Checkpoints
 from physics3d.mpm.implicit import ImplicitSubsteps, NotConverged
 from physics3d.mpm.substep import Hook, Substeps, start_warp

@@ -11,11 +11,11 @@ import numpy as np
 from physics3d.boundaries.half_space import HalfSpace
 from physics3d.boundaries.impulse import Impulse
 from physics3d.materials.viscoelastic import Viscoelastic
-from physics3d.world import World
 from physics3d.scenes.base import AbstractSource, Capture
 from physics3d.scenes.photographs import held_out, triple
 from physics3d.scenes.studio import Light, Mesh, Studio, photographs, ring, surface_grid, to_linear
 from physics3d.scenes.synthetic import film, particles
+from physics3d.world import World
 
 RADIUS = 0.05  # [m]
 

@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from physics3d.artifact import AbstractArtifact, require_finite
+from physics3d.boundaries.base import AbstractBoundary
 from physics3d.gaussians.cameras import Camera
 from physics3d.gaussians.model import Gaussians
-from physics3d.boundaries.base import AbstractBoundary
 
 
 @dataclass(frozen=True, kw_only=True)

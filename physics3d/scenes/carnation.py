@@ -13,16 +13,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from physics3d.gaussians.cameras import Camera
 from physics3d.boundaries.fixed_region import FixedRegion
 from physics3d.boundaries.impulse import Impulse
+from physics3d.gaussians.cameras import Camera
 from physics3d.materials.viscoelastic import Viscoelastic
-from physics3d.world import World
 from physics3d.scenes.base import AbstractSource, Capture
 from physics3d.scenes.flower import SOIL, blossom_centre, plant, surroundings
 from physics3d.scenes.photographs import held_out, triple
 from physics3d.scenes.studio import Light, Studio, photographs, ring
 from physics3d.scenes.synthetic import film, particles
+from physics3d.world import World
 
 
 @dataclass(frozen=True, kw_only=True)

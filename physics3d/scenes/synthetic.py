@@ -14,13 +14,13 @@ import torch
 from jaxtyping import Float, Float32
 from torch import Tensor
 
-from physics3d.gaussians.cameras import Camera
 from physics3d.boundaries.base import AbstractBoundary
+from physics3d.gaussians.cameras import Camera
 from physics3d.mpm.rollout import rollout
-from physics3d.world import World
 from physics3d.open3d_import import open3d
 from physics3d.scenes.base import Take
 from physics3d.scenes.studio import Mesh, Studio
+from physics3d.world import World
 
 
 def film(

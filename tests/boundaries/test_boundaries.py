@@ -8,7 +8,6 @@ import pytest
 import torch
 from mpm_bodies import block, every_boundary, soft_world, tensors
 
-from physics3d.log import Log
 from physics3d.boundaries import mesh_collider
 from physics3d.boundaries.base import Setting, mirror_nodes
 from physics3d.boundaries.bounding_box import BoundingBox
@@ -20,6 +19,7 @@ from physics3d.boundaries.impulse import Impulse
 from physics3d.boundaries.mesh_collider import MeshCollider
 from physics3d.boundaries.moving_cuboid import MovingCuboid
 from physics3d.boundaries.sequential_release import SequentialRelease
+from physics3d.log import Log
 from physics3d.mpm.rollout import rollout
 from physics3d.open3d_import import open3d
 

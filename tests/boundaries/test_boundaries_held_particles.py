@@ -4,9 +4,9 @@ import pytest
 import torch
 from mpm_bodies import block, soft_world, tensors
 
-from physics3d.log import Log
 from physics3d.boundaries.fixed_region import FixedRegion
 from physics3d.boundaries.held_particles import HeldParticles
+from physics3d.log import Log
 from physics3d.mpm.rollout import rollout
 
 

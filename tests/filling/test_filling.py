@@ -7,10 +7,10 @@ import pytest
 import torch
 from analytic_bodies import annulus, box, cup, discs, joined, sheet, sphere, together, torus, wall
 
-from physics3d.filling.fill import Poisson, WindingNumber, clusters, fill, sample_surface
-from physics3d.log import Log
 from physics3d.boundaries.fixed_region import FixedRegion
 from physics3d.boundaries.impulse import Impulse
+from physics3d.filling.fill import Poisson, WindingNumber, clusters, fill, sample_surface
+from physics3d.log import Log
 from physics3d.materials.neo_hookean import NeoHookean
 from physics3d.mpm.rollout import rollout
 from physics3d.world import World

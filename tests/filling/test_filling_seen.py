@@ -9,11 +9,11 @@ from analytic_bodies import discs, joined, sphere
 from scipy.spatial import cKDTree
 
 from physics3d.filling.fill import AbstractSolid, Poisson, fill
+from physics3d.filling.seen import ground, seen
 from physics3d.gaussians.cameras import Camera, look_at
 from physics3d.gaussians.model import Gaussians
 from physics3d.gaussians.render import render
 from physics3d.log import Log
-from physics3d.filling.seen import ground, seen
 
 RADIUS, SPACING = 0.05, 0.006  # [m]
 

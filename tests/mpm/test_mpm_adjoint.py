@@ -6,9 +6,9 @@ import pytest
 import torch
 from mpm_bodies import block, every_boundary, every_material, soft_world, tensors
 
-from physics3d.log import Log
 from physics3d.boundaries.half_space import HalfSpace
 from physics3d.boundaries.impulse import Impulse
+from physics3d.log import Log
 from physics3d.materials.neo_hookean import NeoHookean
 from physics3d.mpm.rollout import rollout
 

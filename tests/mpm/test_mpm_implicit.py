@@ -8,11 +8,11 @@ import pytest
 import torch
 from mpm_bodies import block, every_boundary, every_material, soft_world, tensors
 
-from physics3d.log import Log
 from physics3d.boundaries.bounding_box import BoundingBox
 from physics3d.boundaries.fixed_region import FixedRegion
 from physics3d.boundaries.half_space import HalfSpace
 from physics3d.boundaries.impulse import Impulse
+from physics3d.log import Log
 from physics3d.materials.drucker_prager import DruckerPrager
 from physics3d.materials.neo_hookean import NeoHookean
 from physics3d.materials.newtonian import Newtonian

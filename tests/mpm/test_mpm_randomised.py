@@ -14,13 +14,13 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from mpm_bodies import block, tensors
 
-from physics3d.log import Log
 from physics3d.boundaries.base import AbstractBoundary
 from physics3d.boundaries.bounding_box import BoundingBox
 from physics3d.boundaries.half_space import HalfSpace
 from physics3d.boundaries.impulse import Impulse
 from physics3d.boundaries.mesh_collider import MeshCollider
 from physics3d.boundaries.moving_cuboid import MovingCuboid
+from physics3d.log import Log
 from physics3d.materials.drucker_prager import DruckerPrager
 from physics3d.materials.newtonian import Newtonian
 from physics3d.materials.viscoelastic import Viscoelastic

@@ -8,8 +8,8 @@ import pytest
 import torch
 from mpm_bodies import block, soft_world, tensors
 
-from physics3d.log import Log
 from physics3d.boundaries.impulse import Impulse
+from physics3d.log import Log
 from physics3d.materials.newtonian import Newtonian
 from physics3d.mpm.rollout import Trajectory, rollout
 from physics3d.world import Estimate

@@ -10,9 +10,9 @@ from physics3d.gaussians.cameras import Camera
 from physics3d.gaussians.model import Gaussians
 from physics3d.log import Log
 from physics3d.metrics.scores import Scores
-from physics3d.world import Estimate
 from physics3d.scenes.base import Capture, Take
 from physics3d.video import Video
+from physics3d.world import Estimate
 
 
 def clip(value: float) -> Video:

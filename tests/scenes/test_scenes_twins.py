@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from physics3d.log import Log
 from physics3d.boundaries.impulse import Impulse
+from physics3d.log import Log
 from physics3d.materials.viscoelastic import Viscoelastic
 from physics3d.mpm.rollout import rollout
 from physics3d.scenes.ball import RADIUS, BallTwin
