@@ -2,8 +2,8 @@
 
 import pytest
 import torch
+from differences import compare
 from mpm_bodies import block, soft_world, tensors
-from test_mpm_adjoint import compare
 
 from physics3d.boundaries.fixed_region import FixedRegion
 from physics3d.filling.fill import Body
