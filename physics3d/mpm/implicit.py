@@ -33,9 +33,9 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from physics3d.mpm import transfer
+from physics3d.mpm import columns, transfer
+from physics3d.mpm.stencil import stencil
 from physics3d.mpm.substep import Substeps
-from physics3d.mpm.transfer import stencil
 from physics3d.warp_types import matrix, vector, vector4
 
 NEWTON = 30  # iterations
@@ -104,7 +104,8 @@ def _stress_adjoint(real) -> wp.Kernel:
 def _stiffness(real) -> wp.Kernel:
     """Kernel: K w of node velocities w: gather L_p(w), C_p : L_p, scatter, in one pass over the particles."""
     vec3, mat33 = vector(real), matrix(real)
-    base, local, weights, _ = stencil(real)
+    first_node, local, weights, _ = stencil(real)
+    gathered, spread = columns.gathered(real, fast=False), columns.spread_vectors(real)
 
     @wp.kernel(module="unique", enable_backward=False)
     def stiffness_kernel(
@@ -125,57 +126,23 @@ def _stiffness(real) -> wp.Kernel:
     ):
         p = wp.tid() + first
         d = offset[p] + u[p] / dx
-        corner = base(cell[p], d)
+        node = first_node(cell[p], d, window)
         ny, nz = window[4], window[5]
-        ix, iy, iz = corner[0] - real(window[0]), corner[1] - real(window[1]), corner[2] - real(window[2])
-        zero, one = real(0.0), real(1.0)
-        inside = ix >= zero and iy >= zero and iz >= zero and ix <= real(window[3] - 3) and iy <= real(ny - 3)
-        if inside and iz <= real(nz - 3):
+        if node >= 0:
             f = local(d)
             weight = weights(f)
-            first_node = (int(ix) * ny + int(iy)) * nz + int(iz)
-            bx, by, bz = vec3(), vec3(), vec3()
-            rx = -f[0]
-            for i in range(3):
-                ry = -f[1]
-                for j in range(3):
-                    s, sz = vec3(), vec3()
-                    rz = -f[2]
-                    for k in range(3):
-                        a = weight[2, k] * w[first_node + (i * ny + j) * nz + k]
-                        s = s + a
-                        sz = sz + rz * a
-                        rz = rz + one
-                    wij = weight[0, i] * weight[1, j]
-                    bx = bx + (wij * rx) * s
-                    by = by + (wij * ry) * s
-                    bz = bz + wij * sz
-                    ry = ry + one
-                rx = rx + one
-            L = wp.matrix_from_cols(bx, by, bz)
+            S = gathered(w, node, ny, nz, f, weight)
+            L = mat33(S[1, 0], S[2, 0], S[3, 0], S[1, 1], S[2, 1], S[3, 1], S[1, 2], S[2, 2], S[3, 2])
             A = mat33()
             for a in range(3):
                 for b in range(3):
-                    total = zero
+                    total = real(0.0)
                     for c in range(3):
                         for e in range(3):
                             total = total + C[p, 27 * a + 9 * b + 3 * c + e] * L[c, e]
                     A[a, b] = total
             A = (real(16.0) * clock[row[0], 0] * volume[p] / (dx * dx)) * A
-            ax = vec3(A[0, 0], A[1, 0], A[2, 0])
-            ay = vec3(A[0, 1], A[1, 1], A[2, 1])
-            az = vec3(A[0, 2], A[1, 2], A[2, 2])
-            qi = -(A * f)
-            for i in range(3):
-                qij = qi
-                for j in range(3):
-                    q = qij
-                    wij = weight[0, i] * weight[1, j]
-                    for k in range(3):
-                        wp.atomic_add(Kw, first_node + (i * ny + j) * nz + k, (wij * weight[2, k]) * q)
-                        q = q + az
-                    qij = qij + ay
-                qi = qi + ax
+            spread(Kw, node, ny, nz, weight, -(A * f), A)
 
     return stiffness_kernel
 
@@ -185,7 +152,7 @@ def _diagonal(real) -> wp.Kernel:
     """Kernel: the 3 x 3 blocks of K on its diagonal, C_p replaced by the isotropic tensor with the same means:
     C_ab,cd r_b r_d -> c_1 |r|^2 I + c_2 r r^T."""
     vec3, mat33 = vector(real), matrix(real)
-    base, local, weights, _ = stencil(real)
+    first_node, local, weights, _ = stencil(real)
 
     @wp.kernel(module="unique", enable_backward=False)
     def diagonal_kernel(
@@ -205,18 +172,14 @@ def _diagonal(real) -> wp.Kernel:
     ):
         p = wp.tid() + first
         d = offset[p] + u[p] / dx
-        corner = base(cell[p], d)
+        node = first_node(cell[p], d, window)
         ny, nz = window[4], window[5]
-        ix, iy, iz = corner[0] - real(window[0]), corner[1] - real(window[1]), corner[2] - real(window[2])
-        zero, one = real(0.0), real(1.0)
-        inside = ix >= zero and iy >= zero and iz >= zero and ix <= real(window[3] - 3) and iy <= real(ny - 3)
-        if inside and iz <= real(nz - 3):
+        if node >= 0:
             f = local(d)
             weight = weights(f)
-            first_node = (int(ix) * ny + int(iy)) * nz + int(iz)
             factor = real(16.0) * clock[row[0], 0] * volume[p] / (dx * dx)
             c1, c2 = factor * moduli[p, 0], factor * moduli[p, 1]
-            unit = wp.identity(n=3, dtype=real)
+            unit, one = wp.identity(n=3, dtype=real), real(1.0)
             rx = -f[0]
             for i in range(3):
                 ry = -f[1]
@@ -226,7 +189,7 @@ def _diagonal(real) -> wp.Kernel:
                         s = weight[0, i] * weight[1, j] * weight[2, k]
                         r = vec3(rx, ry, rz)
                         block = (s * s * c1 * wp.dot(r, r)) * unit + (s * s * c2) * wp.outer(r, r)
-                        wp.atomic_add(blocks, first_node + (i * ny + j) * nz + k, block)
+                        wp.atomic_add(blocks, node + (i * ny + j) * nz + k, block)
                         rz = rz + one
                     ry = ry + one
                 rx = rx + one

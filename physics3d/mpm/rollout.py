@@ -35,10 +35,11 @@ from physics3d.boundaries.base import AbstractBoundary, Setting, Vector, mirror_
 from physics3d.log import Log
 from physics3d.materials import spectral
 from physics3d.mpm.checkpoints import Checkpoints
+from physics3d.mpm.hooks import hooks_of
 from physics3d.mpm.implicit import ImplicitSubsteps, NotConverged
-from physics3d.mpm.substep import Hook, Substeps, start_warp
+from physics3d.mpm.substep import Substeps, start_warp
 from physics3d.mpm.survey import Survey, survey
-from physics3d.mpm.transfer import velocity_gradient
+from physics3d.mpm.velocity_gradient import velocity_gradient
 from physics3d.world import World
 
 RUN = 32  # substeps between two looks at the particles, and between two checkpoints
@@ -562,19 +563,9 @@ class _Solver:
         self.mass = self.setting.mass.to(position.device)[self.order].to(**kind)
         self.volume = self.mass / world.density
         real = _real(world.dtype)
-        pushes, touches, nodes, steers, a, b = [], [], [], [], 0, 2
-        for row, (boundary, width) in enumerate(zip(self.boundaries, self.widths)):
-            for hooks, function in (
-                (pushes, boundary.acceleration(real)),
-                (touches, boundary.touch(real)),
-                (nodes, boundary.node(real)),
-                (steers, boundary.steer(real)),
-            ):
-                if function is not None:
-                    hooks.append((function, a, b, row))
-            a, b = a + width, b + len(boundary.signals(0.0, 0.0))
+        hooks = hooks_of(self.boundaries, self.widths, real)
         selection = [boundary.selection(self.setting) for boundary in self.boundaries]
-        self.bounded = bool(nodes)
+        self.bounded = bool(hooks.node)
         threads = self.threads
         if threads is None:
             threads = min(os.cpu_count() or 1, 8, 1 + len(position) // 4000)
@@ -590,11 +581,11 @@ class _Solver:
             coefficients=coefficients.contiguous(),
             q=q,
             selection=torch.stack(selection)[:, self.order.cpu()].to(**kind) if selection else torch.zeros(0, 0),
-            signals=b - 2,
-            pushes=tuple[Hook, ...](pushes),
-            nodes=tuple[Hook, ...](nodes),
-            touches=tuple[Hook, ...](touches),
-            steers=tuple[Hook, ...](steers),
+            signals=hooks.signals,
+            pushes=hooks.push,
+            nodes=hooks.node,
+            touches=hooks.touch,
+            steers=hooks.steer,
             walls=mirror_nodes(self.boundaries, self.setting),
             material=world.material.advance(real),
             memory_rows=world.material.memory_rows,

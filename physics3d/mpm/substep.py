@@ -19,293 +19,22 @@ in a fixed order: reruns are equal bit by bit. On CUDA there is one worker and t
 
 import threading
 from collections.abc import Callable, Sequence
-from functools import cache
 from itertools import pairwise
 
 import numpy as np
 import torch
 import warp as wp
 
-from physics3d.mpm import transfer
-from physics3d.mpm.fused import Hook, particle_pass
+from physics3d.mpm import grids, transfer
+from physics3d.mpm.advance import advance
+from physics3d.mpm.fused import particle_pass
+from physics3d.mpm.hooks import Hook
+from physics3d.mpm.mark import mark
+from physics3d.mpm.push import push
 from physics3d.mpm.state import State, make_state
-from physics3d.warp_types import matrix, vector, vector4
-
-
-@cache
-def _push(real, hooks: tuple[Hook, ...]) -> wp.Kernel:
-    vec3 = vector(real)
-    count = len(hooks)
-    functions, a, b, rows = zip(*hooks)
-
-    @wp.kernel(module="unique")
-    def push_kernel(
-        # in
-        first: int,
-        clock: wp.array2d(dtype=real),
-        row: wp.array(dtype=int),
-        selection: wp.array2d(dtype=real),  # [boundary, p]
-        rest: wp.array(dtype=vec3),  # [p] [m]
-        q: wp.array(dtype=real),  # parameters of the boundaries
-        u: wp.array(dtype=vec3),
-        v: wp.array(dtype=vec3),
-        # out
-        v_pushed: wp.array(dtype=vec3),
-    ):
-        p = wp.tid() + first
-        r = row[0]
-        dt = clock[r, 0]
-        x = rest[p] + u[p]
-        total = v[p]
-        for i in range(wp.static(count)):
-            weight = selection[wp.static(rows[i]), p]
-            if weight != real(0.0):
-                total = total + dt * wp.static(functions[i])(weight, x, q, wp.static(a[i]), clock, r, wp.static(b[i]))
-        v_pushed[p] = total
-
-    return push_kernel
-
-
-@cache
-def _mark(real, hooks: tuple[Hook, ...]) -> wp.Kernel:
-    """Kernel: for each boundary that acts on touched nodes alone, stamp the nodes of the particles that touch it."""
-    vec3 = vector(real)
-    base, _, _, _ = transfer.stencil(real)
-    count = len(hooks)
-    functions, a, b, _ = zip(*hooks)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def mark_kernel(
-        # in
-        first: int,
-        dx: real,
-        window: wp.array(dtype=int),
-        clock: wp.array2d(dtype=real),
-        row: wp.array(dtype=int),
-        stamp: wp.array(dtype=int),  # [1] another one in every substep, so that nothing need be cleared
-        rest: wp.array(dtype=vec3),  # [p] [m]
-        radius: wp.array(dtype=real),  # [p] [m]
-        cell: wp.array(dtype=wp.vec3i),
-        offset: wp.array(dtype=vec3),
-        q: wp.array(dtype=real),
-        u: wp.array(dtype=vec3),
-        # out
-        touched: wp.array2d(dtype=int),  # [hook, node] the stamp: whoever writes, writes the same
-    ):
-        p = wp.tid() + first
-        x = rest[p] + u[p]
-        corner = base(cell[p], offset[p] + u[p] / dx)
-        ix, iy, iz = corner[0] - real(window[0]), corner[1] - real(window[1]), corner[2] - real(window[2])
-        nx, ny, nz = window[3], window[4], window[5]
-        zero = real(0.0)
-        inside = ix >= zero and iy >= zero and iz >= zero and ix <= real(nx - 3) and iy <= real(ny - 3)
-        if inside and iz <= real(nz - 3):
-            for h in range(wp.static(count)):
-                if wp.static(functions[h])(x, radius[p], q, wp.static(a[h]), clock, row[0], wp.static(b[h])):
-                    for n in range(27):
-                        at = ((int(ix) + n / 9) * ny + int(iy) + (n / 3) % 3) * nz + int(iz) + n % 3
-                        touched[h, at] = stamp[0]
-
-    return mark_kernel
-
-
-@cache
-def _mirror(real) -> tuple[wp.Function, wp.Function]:
-    """Warp functions of walls that mirror: walls[0:3] lower, walls[3:6] upper nodes, then 1 where one is sticky.
-
-    flip(axis, sticky) is the sign of each velocity component in the image; folded(at, window, walls, grid) the momentum
-    and mass of a node in front of the walls with those of its images one node behind them (27 at an inner corner)."""
-    vec3, vec4 = vector(real), vector4(real)
-
-    @wp.func
-    def flip(axis: int, sticky: int) -> vec3:
-        one = real(1.0)
-        sign = vec3(-one, -one, -one)
-        if sticky == 0:
-            sign = vec3(wp.where(axis == 0, -one, one), wp.where(axis == 1, -one, one), wp.where(axis == 2, -one, one))
-        return sign
-
-    @wp.func
-    def folded(at: wp.vec3i, window: wp.array(dtype=int), walls: wp.array(dtype=int), grid: wp.array(dtype=vec4)):
-        total = vec4()
-        # along each axis: itself, then its images in the lower and in the upper wall where it has them
-        low = wp.vec3i(0, 0, 0)
-        ways = wp.vec3i(1, 1, 1)
-        for axis in range(3):
-            low[axis] = wp.where(at[axis] == walls[axis] + 1, 1, 0)
-            ways[axis] = 1 + low[axis] + wp.where(at[axis] == walls[3 + axis] - 1, 1, 0)
-        for c in range(ways[0] * ways[1] * ways[2]):
-            choice = wp.vec3i(c % ways[0], (c / ways[0]) % ways[1], c / (ways[0] * ways[1]))
-            image = at - wp.vec3i(window[0], window[1], window[2])
-            sign = vec3(real(1.0), real(1.0), real(1.0))
-            there = 1
-            for axis in range(3):
-                if choice[axis] > 0:
-                    lower = choice[axis] == 1 and low[axis] == 1
-                    image[axis] = image[axis] + wp.where(lower, -2, 2)
-                    sign = wp.cw_mul(sign, flip(axis, walls[wp.where(lower, 6, 9) + axis]))
-                if image[axis] < 0 or image[axis] >= window[3 + axis]:
-                    there = 0
-            if there == 1:
-                node = grid[(image[0] * window[4] + image[1]) * window[5] + image[2]]
-                total = total + vec4(sign[0] * node[0], sign[1] * node[1], sign[2] * node[2], node[3])
-        return total
-
-    return flip, folded
-
-
-@wp.func
-def index(at: wp.vec3i, window: wp.array(dtype=int)):
-    """Number of a node in the window, -1 if it is not there."""
-    i, j, k = at[0] - window[0], at[1] - window[1], at[2] - window[2]
-    n = (i * window[4] + j) * window[5] + k
-    if i < 0 or j < 0 or k < 0 or i >= window[3] or j >= window[4] or k >= window[5]:
-        n = -1
-    return n
-
-
-@cache
-def _update(real, hooks: tuple[Hook, ...], touches: tuple[Hook, ...], mirrored: bool) -> wp.Kernel:
-    vec3, vec4 = vector(real), vector4(real)
-    flip, folded = _mirror(real)
-    count = len(hooks)
-    functions, a, b, rows = zip(*hooks) if hooks else ((), (), (), ())
-    # of the boundary of each hook, its place among those that act on touched nodes alone, or -1
-    mark_row = {row: place for place, (_, _, _, row) in enumerate(touches)}
-    marks = tuple(mark_row.get(row, -1) for row in rows)
-
-    @wp.kernel(module="unique")
-    def update_kernel(
-        # in
-        first: int,
-        dx: real,
-        origin: vec3,  # place of node (0, 0, 0) [m]
-        gravity: vec3,  # [m/s^2]
-        mass_floor: real,  # lighter nodes stay at rest [kg]
-        window: wp.array(dtype=int),
-        clock: wp.array2d(dtype=real),  # columns 0: dt [s], 1: exp(-damping dt)
-        row: wp.array(dtype=int),
-        walls: wp.array(dtype=int),
-        stamp: wp.array(dtype=int),
-        touched: wp.array2d(dtype=int),  # [hook, node]
-        q: wp.array(dtype=real),
-        grid: wp.array(dtype=vec4),
-        # out
-        node_velocity: wp.array(dtype=vec3),
-    ):
-        n = wp.tid() + first
-        r = row[0]
-        k = n % window[5]
-        j = (n / window[5]) % window[4]
-        i = n / (window[5] * window[4])
-        at = wp.vec3i(window[0] + i, window[1] + j, window[2] + k)
-        node = grid[n]
-        here = n
-        sign = vec3(real(1.0), real(1.0), real(1.0))
-        if wp.static(mirrored):
-            near = 0
-            for axis in range(3):
-                below, above = at[axis] - walls[axis], walls[3 + axis] - at[axis]
-                if below == -1:
-                    at[axis] = at[axis] + 2
-                    sign = wp.cw_mul(sign, flip(axis, walls[6 + axis]))
-                elif above == -1:
-                    at[axis] = at[axis] - 2
-                    sign = wp.cw_mul(sign, flip(axis, walls[9 + axis]))
-                if wp.abs(below) == 1 or wp.abs(above) == 1:
-                    near = 1
-            if near == 1:
-                node = folded(at, window, walls, grid)
-                # a mirror image obeys what its original does
-                here = index(at, window)
-        m = node[3]
-        v = vec3()
-        if m > mass_floor:
-            v = clock[r, 1] * (vec3(node[0], node[1], node[2]) / m + clock[r, 0] * gravity)
-            x = origin + dx * vec3(real(at[0]), real(at[1]), real(at[2]))
-            for h in range(wp.static(count)):
-                if wp.static(marks[h] < 0):
-                    v = wp.static(functions[h])(x, v, q, wp.static(a[h]), clock, r, wp.static(b[h]))
-                elif here >= 0 and touched[wp.static(marks[h]), wp.max(here, 0)] == stamp[0]:
-                    # both sides of this `and` are computed
-                    v = wp.static(functions[h])(x, v, q, wp.static(a[h]), clock, r, wp.static(b[h]))
-        if wp.static(mirrored):
-            v = wp.cw_mul(sign, v)
-        node_velocity[n] = v
-
-    return update_kernel
-
-
-@cache
-def _steer(real, hooks: tuple[Hook, ...]) -> wp.Kernel:
-    vec3, mat33 = vector(real), matrix(real)
-    count = len(hooks)
-    functions, a, b, rows = zip(*hooks)
-
-    @wp.kernel(module="unique")
-    def steer_kernel(
-        # in
-        first: int,
-        clock: wp.array2d(dtype=real),
-        row: wp.array(dtype=int),
-        selection: wp.array2d(dtype=real),
-        rest: wp.array(dtype=vec3),
-        q: wp.array(dtype=real),
-        u: wp.array(dtype=vec3),
-        v_gathered: wp.array(dtype=vec3),
-        L_gathered: wp.array(dtype=mat33),
-        # out
-        v: wp.array(dtype=vec3),
-        L: wp.array(dtype=mat33),
-    ):
-        p = wp.tid() + first
-        r = row[0]
-        x = rest[p] + u[p]
-        speed = v_gathered[p]
-        gradient = L_gathered[p]
-        for i in range(wp.static(count)):
-            weight = selection[wp.static(rows[i]), p]
-            if weight != real(0.0):
-                speed, gradient = wp.static(functions[i])(
-                    weight, x, speed, gradient, q, wp.static(a[i]), clock, r, wp.static(b[i])
-                )
-        v[p] = speed
-        L[p] = gradient
-
-    return steer_kernel
-
-
-@cache
-def _advance(real, material: wp.Function) -> wp.Kernel:
-    vec3, mat33 = vector(real), matrix(real)
-
-    @wp.kernel(module="unique")
-    def advance_kernel(
-        # in
-        first: int,
-        clock: wp.array2d(dtype=real),
-        row: wp.array(dtype=int),
-        u: wp.array(dtype=vec3),
-        v: wp.array(dtype=vec3),
-        L: wp.array(dtype=mat33),
-        H: wp.array(dtype=mat33),
-        coefficients: wp.array2d(dtype=real),  # [k, p]
-        memory: wp.array2d(dtype=real),  # [m, p]
-        # out
-        u_next: wp.array(dtype=vec3),
-        H_next: wp.array(dtype=mat33),
-        memory_next: wp.array2d(dtype=real),
-        tau: wp.array(dtype=mat33),
-    ):
-        p = wp.tid() + first
-        dt = clock[row[0], 0]
-        u_next[p] = u[p] + dt * v[p]
-        deformation, stress = material(p, dt, L[p], H[p], coefficients, memory, memory_next)
-        H_next[p] = deformation
-        tau[p] = stress
-
-    return advance_kernel
-
+from physics3d.mpm.steer import steer
+from physics3d.mpm.update import update
+from physics3d.warp_types import vector, vector4
 
 _KEEP_MOMENTA = 4  # nodes per particle up to which the momenta of nodes are kept for the way back
 _KEEP = 5  # place of `keep`, then `onward`, among the arguments of the particle pass
@@ -363,18 +92,18 @@ class Substeps:
         self.fast = self.device.type == "cpu" if fast is None else fast
         self.kernels = {
             "scatter": transfer.scatter(self.real, self.fast),
-            "update": _update(self.real, nodes, touches, walls is not None),
+            "update": update(self.real, nodes, touches, walls is not None),
             "gather": transfer.gather(self.real, self.fast),
-            "advance": _advance(self.real, material),
+            "advance": advance(self.real, material),
         }
         if self.fast:
             self.kernels["pass"] = particle_pass(self.real, material, pushes, steers)
         if touches:
-            self.kernels["mark"] = _mark(self.real, touches)
+            self.kernels["mark"] = mark(self.real, touches)
         if pushes:
-            self.kernels["push"] = _push(self.real, pushes)
+            self.kernels["push"] = push(self.real, pushes)
         if steers:
-            self.kernels["steer"] = _steer(self.real, steers)
+            self.kernels["steer"] = steer(self.real, steers)
         self.shape = dict(memory_rows=memory_rows, steered=bool(steers))
         vec3, real = vector(self.real), self.real
         self.constant = {
@@ -644,8 +373,8 @@ class Substeps:
             for name, (inputs, outputs) in self._arguments(w, i, j).items():
                 if name in self.kernels:
                     record[name] = self._record(self.kernels[name], count, inputs, outputs)
-            record["clear"] = self._record(transfer.clear(vector4(self.real)), 1, [0], [self.grid[w]])
-            record["total"] = self._record(transfer.total(vector4(self.real)), 1, [0], [self.grid])
+            record["clear"] = self._record(grids.clear(vector4(self.real)), 1, [0], [self.grid[w]])
+            record["total"] = self._record(grids.total(vector4(self.real)), 1, [0], [self.grid])
             self.launches[key] = record
         return self.launches[key]
 
@@ -690,14 +419,14 @@ class Substeps:
             )
             if self.fast:
                 outputs = [self.adjoint_node_velocity[0]]
-                record["total"] = self._record(transfer.total_of_fours(self.real), 1, [0, private], outputs)
+                record["total"] = self._record(grids.total_of_fours(self.real), 1, [0, private], outputs)
             elif self.workers > 1:
-                record["total"] = self._record(transfer.total(vec3), 1, [0], [private])
-            record["clear_private"] = self._record(transfer.clear(vec4 if self.fast else vec3), 1, [0], [private[w]])
+                record["total"] = self._record(grids.total(vec3), 1, [0], [private])
+            record["clear_private"] = self._record(grids.clear(vec4 if self.fast else vec3), 1, [0], [private[w]])
             if self.v_pushed is not None:
                 first = [self.ranges[w][0]]
-                record["clear_pushed"] = self._record(transfer.clear(vec3), count, first, [adjoint["v_pushed"]])
-            record["clear_grid"] = self._record(transfer.clear(vec4), 1, [0], [self.adjoint_grid])
+                record["clear_pushed"] = self._record(grids.clear(vec3), count, first, [adjoint["v_pushed"]])
+            record["clear_grid"] = self._record(grids.clear(vec4), 1, [0], [self.adjoint_grid])
             self.launches[key] = record
         return self.launches[key]
 
