@@ -40,7 +40,8 @@ from physics3d.gaussians.render import render
 from physics3d.gaussians.sh import C0, sh_color
 from physics3d.log import Log
 from physics3d.materials.neo_hookean import NeoHookean
-from physics3d.mpm.rollout import Trajectory, rollout
+from physics3d.mpm.rollout import rollout
+from physics3d.trajectory import Trajectory
 from physics3d.world import World
 
 RESULTS = Path(__file__).parents[1] / "docs/results"

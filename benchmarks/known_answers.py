@@ -28,7 +28,8 @@ from physics3d.materials.neo_hookean import NeoHookean
 from physics3d.materials.newtonian import Newtonian
 from physics3d.materials.viscoelastic import Viscoelastic
 from physics3d.materials.von_mises import VonMises
-from physics3d.mpm.rollout import Trajectory, rollout
+from physics3d.mpm.rollout import rollout
+from physics3d.trajectory import Trajectory
 from physics3d.warp_types import matrix, vector
 from physics3d.world import World
 

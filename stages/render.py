@@ -11,8 +11,8 @@ from physics3d.gaussians.deform import Backdrop, render_deformed
 from physics3d.gaussians.interior import Interior, paint
 from physics3d.gaussians.model import Gaussians
 from physics3d.log import Log
-from physics3d.mpm.rollout import Trajectory
 from physics3d.scenes.base import Capture
+from physics3d.trajectory import Trajectory
 from physics3d.video import Video, contact_sheet, space_time_slice, to_uint8, write_mp4
 
 

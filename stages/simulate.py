@@ -10,7 +10,8 @@ from physics3d.boundaries.base import AbstractBoundary
 from physics3d.boundaries.impulse import Impulse
 from physics3d.filling.fill import Body
 from physics3d.log import Log
-from physics3d.mpm.rollout import Trajectory, rollout
+from physics3d.mpm.rollout import rollout
+from physics3d.trajectory import Trajectory
 from physics3d.world import Estimate, World
 
 

@@ -14,9 +14,9 @@ def clear(dtype) -> wp.Kernel:
     @wp.kernel(module="unique", enable_backward=False)
     def clear_kernel(
         # in
-        first: int,
+        first: int,  # node of thread 0
         # out
-        values: wp.array(dtype=dtype),
+        values: wp.array(dtype=dtype),  # [node]
     ):
         values[wp.tid() + first] = dtype()
 
@@ -31,8 +31,8 @@ def total(dtype) -> wp.Kernel:
     def total_kernel(
         # in
         first: int,  # node of thread 0
-        # in, out
-        grids: wp.array2d(dtype=dtype),  # [threads, node]
+        # out
+        grids: wp.array2d(dtype=dtype),  # [threads, node] read, and the first row written
     ):
         i = wp.tid() + first
         s = grids[0, i]
@@ -51,7 +51,7 @@ def total_of_fours(real) -> wp.Kernel:
     @wp.kernel(module="unique", enable_backward=False)
     def total_of_fours_kernel(
         # in
-        first: int,
+        first: int,  # node of thread 0
         grids: wp.array2d(dtype=vec4),  # [threads, node]
         # out
         values: wp.array(dtype=vec3),  # [node]

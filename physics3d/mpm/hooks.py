@@ -5,8 +5,9 @@
     node    velocity of a grid node -> velocity of that node                 (walls, colliders, held regions)
     steer   velocity and its gradient of selected particles after the gather (motion imposed on the body itself)
 
-A kernel is made for the hooks of a scene, in the order of its boundaries; scenes with equal hooks share it. Only the body
-of a kernel may call them: Warp tells kernels apart by their own `wp.static` values, not by those of functions in them.
+A kernel is made for the hooks of a scene, in the order of its boundaries; scenes with equal hooks share it. Only the
+body of a kernel may call them: Warp tells kernels apart by their own `wp.static` values, not by those of functions in
+them.
 """
 
 from collections.abc import Sequence

@@ -78,11 +78,11 @@ def gather(real, fast: bool = False) -> wp.Kernel:
     @wp.kernel(module="unique", enable_backward=False)
     def gather_kernel(
         # in
-        first: int,
-        dx: real,
-        window: wp.array(dtype=int),
-        cell: wp.array(dtype=wp.vec3i),
-        offset: wp.array(dtype=vec3),
+        first: int,  # particle of thread 0
+        dx: real,  # [m]
+        window: wp.array(dtype=int),  # [6] lowest node and number of nodes along each axis
+        cell: wp.array(dtype=wp.vec3i),  # [p] of the rest position
+        offset: wp.array(dtype=vec3),  # [p] of the rest position in its cell [cells]
         u: wp.array(dtype=vec3),  # [p] displacement at the scatter [m]
         node_velocity: wp.array(dtype=vec3),  # [node] [m/s]
         # out
@@ -118,26 +118,26 @@ def scatter_adjoint(real, fast: bool = False) -> wp.Kernel:
     @wp.kernel(module="unique", enable_backward=False)
     def scatter_adjoint_kernel(
         # in
-        first: int,
-        dx: real,
-        window: wp.array(dtype=int),
-        clock: wp.array2d(dtype=real),
-        row: wp.array(dtype=int),
-        mass: wp.array(dtype=real),
-        volume: wp.array(dtype=real),
-        cell: wp.array(dtype=wp.vec3i),
-        offset: wp.array(dtype=vec3),
-        u: wp.array(dtype=vec3),
-        v: wp.array(dtype=vec3),
-        L: wp.array(dtype=mat33),
-        tau: wp.array(dtype=mat33),
+        first: int,  # particle of thread 0
+        dx: real,  # [m]
+        window: wp.array(dtype=int),  # [6] lowest node and number of nodes along each axis
+        clock: wp.array2d(dtype=real),  # [substep, k] column 0: dt [s]
+        row: wp.array(dtype=int),  # [1] the substep
+        mass: wp.array(dtype=real),  # [p] [kg]
+        volume: wp.array(dtype=real),  # [p] at rest [m^3]
+        cell: wp.array(dtype=wp.vec3i),  # [p] of the rest position
+        offset: wp.array(dtype=vec3),  # [p] of the rest position in its cell [cells]
+        u: wp.array(dtype=vec3),  # [p] displacement [m]
+        v: wp.array(dtype=vec3),  # [p] [m/s]
+        L: wp.array(dtype=mat33),  # [p] [1/s]
+        tau: wp.array(dtype=mat33),  # [p] Kirchhoff stress [Pa]
         adjoint_grid: wp.array(dtype=vec4),  # [node]
         # out, added to
-        adjoint_offset: wp.array(dtype=vec3),
-        adjoint_u: wp.array(dtype=vec3),
-        adjoint_v: wp.array(dtype=vec3),
-        adjoint_L: wp.array(dtype=mat33),
-        adjoint_tau: wp.array(dtype=mat33),
+        adjoint_offset: wp.array(dtype=vec3),  # [p]
+        adjoint_u: wp.array(dtype=vec3),  # [p]
+        adjoint_v: wp.array(dtype=vec3),  # [p]
+        adjoint_L: wp.array(dtype=mat33),  # [p]
+        adjoint_tau: wp.array(dtype=mat33),  # [p]
     ):
         p = wp.tid() + first
         dt = clock[row[0], 0]
@@ -178,19 +178,19 @@ def gather_adjoint(real, fast: bool = False) -> wp.Kernel:
     @wp.kernel(module="unique", enable_backward=False)
     def gather_adjoint_kernel(
         # in
-        first: int,
-        dx: real,
-        window: wp.array(dtype=int),
-        cell: wp.array(dtype=wp.vec3i),
-        offset: wp.array(dtype=vec3),
-        u: wp.array(dtype=vec3),
-        node_velocity: wp.array(dtype=vec3),
+        first: int,  # particle of thread 0
+        dx: real,  # [m]
+        window: wp.array(dtype=int),  # [6] lowest node and number of nodes along each axis
+        cell: wp.array(dtype=wp.vec3i),  # [p] of the rest position
+        offset: wp.array(dtype=vec3),  # [p] of the rest position in its cell [cells]
+        u: wp.array(dtype=vec3),  # [p] displacement [m]
+        node_velocity: wp.array(dtype=vec3),  # [node] [m/s]
         adjoint_v: wp.array(dtype=vec3),  # [p]
         adjoint_L: wp.array(dtype=mat33),  # [p]
         # out, added to
-        adjoint_offset: wp.array(dtype=vec3),
-        adjoint_u: wp.array(dtype=vec3),
-        adjoint_node_velocity: wp.array(dtype=node_kind),
+        adjoint_offset: wp.array(dtype=vec3),  # [p]
+        adjoint_u: wp.array(dtype=vec3),  # [p]
+        adjoint_node_velocity: wp.array(dtype=node_kind),  # [node]
     ):
         p = wp.tid() + first
         d = offset[p] + u[p] / dx
