@@ -10,8 +10,8 @@ a voxel of the surface.
 
 These Gaussians lie where the surface is. Those of a fit do not: the last part reconstructs the carnation from its 40
 photographs and fills it, without asking the photographs' cameras (the surface is then a deviation outside the
-Gaussians' centres) and asking them (physics3d/filling/seen.py). Measured is its stem, without the leaves; labels are those of
-the nearest mesh. A stem bends with its second moment of area, which goes with the fourth power of the radius.
+Gaussians' centres) and asking them (physics3d/filling/seen.py). Measured is its stem, without the leaves; labels are
+those of the nearest mesh. A stem bends with its second moment of area, which goes with the fourth power of the radius.
 """
 
 import csv
@@ -31,7 +31,10 @@ from analytic_bodies import annulus, box, cup, discs, petal, sphere, together, t
 from labelled_twins import carnation
 
 from benchmarks.machine import machine
-from physics3d.filling.fill import AbstractSolid, Body, Poisson, Surface, WindingNumber, fill, sample_surface
+from physics3d.filling.body import Body
+from physics3d.filling.fill import fill
+from physics3d.filling.solids import AbstractSolid, Poisson, WindingNumber
+from physics3d.filling.surface import Surface, sample_surface
 from physics3d.gaussians.model import Gaussians
 from physics3d.log import Log
 from physics3d.scenes.flower import STEM_TOP, plant, stem_curve

@@ -16,7 +16,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from physics3d.gaussians.deform import carry, embed
+from physics3d.gaussians.carry import carry
+from physics3d.gaussians.embedding import embed
 from physics3d.gaussians.model import Gaussians
 from physics3d.log import Log
 from physics3d.boundaries.base import AbstractBoundary, Setting, inside_box

@@ -2,17 +2,17 @@
 
 import torch
 
-from physics3d.filling.fill import Body
-from physics3d.gaussians.cameras import Camera, look_at
-from physics3d.gaussians.deform import embed
-from physics3d.gaussians.model import Gaussians
-from physics3d.learning.fields import GlobalField
 from physics3d.boundaries.fixed_region import FixedRegion
 from physics3d.boundaries.impulse import Impulse
+from physics3d.filling.body import Body
+from physics3d.gaussians.cameras import Camera, look_at
+from physics3d.gaussians.embedding import embed
+from physics3d.gaussians.model import Gaussians
+from physics3d.learning.fields import GlobalField
 from physics3d.materials.viscoelastic import Viscoelastic
-from physics3d.world import World
 from physics3d.priors.exemplar import Exemplar
 from physics3d.scenes.base import Capture, Take
+from physics3d.world import World
 from stages.learn import Learn
 
 ELASTIC = {"youngs_modulus": 2e4, "poissons_ratio": 0.3}

@@ -5,11 +5,11 @@ import torch
 from mpm_bodies import block, soft_world, tensors
 from test_mpm_adjoint import compare
 
-from physics3d.filling.fill import Body
-from physics3d.gaussians.deform import embed
+from physics3d.boundaries.fixed_region import FixedRegion
+from physics3d.filling.body import Body
+from physics3d.gaussians.embedding import embed
 from physics3d.log import Log
 from physics3d.materials import driver
-from physics3d.boundaries.fixed_region import FixedRegion
 from physics3d.materials.mixture import Mixture
 from physics3d.materials.neo_hookean import NeoHookean
 from physics3d.materials.viscoelastic import Viscoelastic
