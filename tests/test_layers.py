@@ -8,7 +8,15 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 SOURCES = sorted(p for folder in ("physics3d", "stages", "pipeline") for p in (ROOT / folder).rglob("*.py"))
-BOTTOM = ("physics3d.artifact", "physics3d.video", "physics3d.log", "physics3d.open3d_import", "physics3d.warp_types")
+BOTTOM = (
+    "physics3d.artifact",
+    "physics3d.video",
+    "physics3d.pictures",
+    "physics3d.log",
+    "physics3d.open3d_import",
+    "physics3d.warp_types",
+    "physics3d.clusters",
+)
 # what each room of the library may use beside itself and the bottom; rooms that are not listed may use all of these
 ROOMS = {
     "physics3d.materials": (),

@@ -6,8 +6,8 @@ from differences import compare
 from mpm_bodies import block, soft_world, tensors
 
 from physics3d.boundaries.fixed_region import FixedRegion
-from physics3d.filling.fill import Body
-from physics3d.gaussians.deform import embed
+from physics3d.filling.body import Body
+from physics3d.gaussians.embedding import embed
 from physics3d.log import Log
 from physics3d.materials import driver
 from physics3d.materials.mixture import Mixture
