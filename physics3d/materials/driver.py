@@ -143,14 +143,14 @@ def _kernel(function: wp.Function, real: type) -> wp.Kernel:
     def material_points(
         # in
         dt: real,  # [s]
-        L: wp.array(dtype=mat33),  # velocity gradient [1/s]
-        H: wp.array(dtype=mat33),  # deformation minus identity
-        coefficients: wp.array2d(dtype=real),
-        memory: wp.array2d(dtype=real),
+        L: wp.array(dtype=mat33),  # [n] velocity gradient [1/s]
+        H: wp.array(dtype=mat33),  # [n] deformation minus identity [1]
+        coefficients: wp.array2d(dtype=real),  # [k, n] of the material
+        memory: wp.array2d(dtype=real),  # [m, n] internal variables
         # out
-        H_next: wp.array(dtype=mat33),
-        tau: wp.array(dtype=mat33),  # Kirchhoff stress [Pa]
-        memory_next: wp.array2d(dtype=real),
+        H_next: wp.array(dtype=mat33),  # [n] [1]
+        tau: wp.array(dtype=mat33),  # [n] Kirchhoff stress [Pa]
+        memory_next: wp.array2d(dtype=real),  # [m, n]
     ):
         p = wp.tid()
         H_p, tau_p = function(p, dt, L[p], H[p], coefficients, memory, memory_next)
