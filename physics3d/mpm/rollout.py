@@ -33,7 +33,8 @@ from torch import Tensor
 from physics3d.artifact import AbstractArtifact, require_finite
 from physics3d.boundaries.base import AbstractBoundary, Setting, Vector, mirror_nodes
 from physics3d.log import Log
-from physics3d.materials import spectral
+from physics3d.materials.tensors.eigen import principal_values
+from physics3d.materials.tensors.volume import determinant
 from physics3d.mpm.checkpoints import Checkpoints
 from physics3d.mpm.implicit import ImplicitSubsteps, NotConverged
 from physics3d.mpm.substep import Hook, Substeps, start_warp
@@ -513,7 +514,7 @@ class _Solver:
     def _health(self, now) -> dict[str, float]:
         """Numbers of one frame for a person to look at; SI. energy counts kinetic, elastic and potential energy."""
         F = now.H.double() + torch.eye(3, dtype=torch.float64, device=now.H.device)
-        J, stretch = spectral.determinant(F), spectral.principal_values(F.mT @ F)[2].sqrt()
+        J, stretch = determinant(F), principal_values(F.mT @ F)[2].sqrt()
         mass, v = self.mass.double(), now.v.double()
         x = self.rest.double() + now.u.double()
         momentum = (mass[:, None] * v).sum(0)
