@@ -177,7 +177,7 @@ def bar(cells: int, branches: int, seconds: float = 2.0, **changes) -> Answer:
     if branches:
         start |= dict(
             branch_shear_modulus=MU_N, branch_bulk_modulus=K_N,
-            shear_viscosity_time=1 / K_D, bulk_viscosity_time=1 / K_V,
+            shear_relaxation_time=1 / K_D, bulk_relaxation_time=1 / K_V,
         )  # fmt: skip
     walls = (_thin(dx, "yz"), HalfSpace(point=(0.0, 0.0, 0.0), normal=(1.0, 0.0, 0.0), kind="sticky"))
     world = _world(dx, changes, material=Viscoelastic(branches=branches), start=start, boundaries=walls)

@@ -19,8 +19,8 @@ ELASTIC = {"youngs_modulus": 2e4, "poissons_ratio": 0.3}
 DAMPED = ELASTIC | {
     "branch_shear_modulus": 6e3,
     "branch_bulk_modulus": 6e3,
-    "shear_viscosity_time": 0.05,
-    "bulk_viscosity_time": 0.05,
+    "shear_relaxation_time": 0.05,
+    "bulk_relaxation_time": 0.05,
 }
 DX = 0.05
 POKE = (Impulse(force=(1.2, 0.0, 0.0), centre=(0.0, 0.0, 0.4), radius=0.12, start=0.0, duration=0.1),)

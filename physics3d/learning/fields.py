@@ -17,6 +17,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from physics3d.materials.parameters import check_old_names
+
 AXES = ("velocity_x", "velocity_y", "velocity_z")
 
 
@@ -33,7 +35,9 @@ class GlobalField:
 
     def __post_init__(self):
         known = ", ".join(self.start)
-        for name in (*self.learn, *(n for tie in self.ties for n in tie)):
+        named = (*self.learn, *(name for tie in self.ties for name in tie))
+        check_old_names(named)
+        for name in named:
             if name not in self.start:
                 raise ValueError(
                     f"learn.learn or learn.ties names {name!r}; the parameters of this material are {known}"

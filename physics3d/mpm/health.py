@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from physics3d.materials import spectral
+from physics3d.materials.tensors.eigen import principal_values
+from physics3d.materials.tensors.volume import determinant
 from physics3d.mpm.body import Body
 from physics3d.mpm.limits import wave_speed
 from physics3d.mpm.state import State
@@ -31,7 +32,7 @@ def health(body: Body, now: State, work: Work, substeps: int) -> dict[str, float
     initial state."""
     world = body.problem.world
     F = now.H.double() + torch.eye(3, dtype=torch.float64, device=now.H.device)
-    J, stretch = spectral.determinant(F), spectral.principal_values(F.mT @ F)[2].sqrt()
+    J, stretch = determinant(F), principal_values(F.mT @ F)[2].sqrt()
     mass, v = body.mass.double(), now.v.double()
     x = body.rest.double() + now.u.double()
     momentum = (mass[:, None] * v).sum(0)

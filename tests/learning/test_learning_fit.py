@@ -40,7 +40,7 @@ OPTIONS = {
 }  # fmt: skip
 
 
-NAMES = ("youngs_modulus", "branch_shear_modulus", "shear_viscosity_time", "poissons_ratio")
+NAMES = ("youngs_modulus", "branch_shear_modulus", "shear_relaxation_time", "poissons_ratio")
 
 
 @pytest.fixture(scope="module")

@@ -158,8 +158,8 @@ def test_viscoelastic_bar():
         poissons_ratio=POISSON,
         branch_shear_modulus=MU_N,
         branch_bulk_modulus=K_N,
-        shear_viscosity_time=1 / K_D,
-        bulk_viscosity_time=1 / K_V,
+        shear_relaxation_time=1 / K_D,
+        bulk_relaxation_time=1 / K_V,
     )
     errors = []
     for cells in (16, 32):
