@@ -15,6 +15,7 @@ BOTTOM = (
     "physics3d.log",
     "physics3d.open3d_import",
     "physics3d.warp_types",
+    "physics3d.warp_start",
     "physics3d.clusters",
     "physics3d.trajectory",
 )

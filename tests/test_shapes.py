@@ -1,4 +1,4 @@
-"""Shapes in annotations are held to while the tests run, and nothing that only tests need is imported by the library."""
+"""Shapes in annotations are held to while the tests run; the library imports nothing that only tests need."""
 
 import ast
 import importlib

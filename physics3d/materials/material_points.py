@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from physics3d.materials.base import AbstractMaterial
+from physics3d.warp_start import start_warp
 from physics3d.warp_types import matrix
 
 _REAL = {torch.float32: wp.float32, torch.float64: wp.float64}
@@ -86,8 +87,7 @@ class _Outputs:
 class _Advance(torch.autograd.Function):
     @staticmethod
     def forward(ctx, material: AbstractMaterial, dt: float, L: Tensor, H: Tensor, coefficients: Tensor, memory: Tensor):
-        wp.config.quiet = True
-        wp.init()
+        start_warp()
         n, real = len(H), _REAL[H.dtype]
         L, H, columns, memory = (t.detach().contiguous() for t in (L, H, coefficients.expand(-1, n), memory))
         inputs = _Inputs(L=L, H=H, coefficients=columns, memory=memory)
