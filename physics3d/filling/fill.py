@@ -31,6 +31,7 @@ from physics3d.artifact import AbstractArtifact, require_finite
 from physics3d.boundaries.base import AbstractBoundary
 from physics3d.boundaries.fixed_region import FixedRegion
 from physics3d.boundaries.held_particles import HeldParticles
+from physics3d.checks import Share
 from physics3d.filling.seen import Ground, Seen, ground, seen
 from physics3d.gaussians.cameras import Camera
 from physics3d.gaussians.deform import Embedding, embed
@@ -119,7 +120,7 @@ class AbstractSolid:
 class Poisson(AbstractSolid):
     """Inside the screened Poisson surface of the samples that bound a volume. Closes missing caps."""
 
-    enclosure: float = 0.4  # least share of directions in which a point inside must meet the surface
+    enclosure: Share = 0.4  # least share of directions in which a point inside must meet the surface
 
     def inside(self, surface: Surface, spacing: float) -> Callable[[np.ndarray], np.ndarray]:
         chosen = ~surface.thin & ~surface.hidden

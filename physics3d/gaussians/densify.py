@@ -19,6 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from physics3d.checks import Count, Factor, NotNegative, require_fields
 from physics3d.gaussians.model import Gaussians
 
 Moments = dict[str, tuple[Tensor, Tensor]]  # of Adam, per field of Gaussians; they follow splits and removals
@@ -29,6 +30,10 @@ class AbstractDensification:
     """A frozen dataclass with `every`: iterations between two calls of `renewed`."""
 
     every: int
+
+    def check(self) -> None:
+        """Raise ValueError naming field, value and remedy."""
+        require_fields(self, "densification")
 
     def renewed(
         self, model: Gaussians, moments: Moments, error: Callable[[], Tensor], wanted: int, generator: torch.Generator
@@ -50,9 +55,9 @@ class AbstractDensification:
 
 @dataclass(frozen=True, kw_only=True)
 class Adaptive(AbstractDensification):
-    every: int = 100
-    faded: float = 0.02  # opacity below which a Gaussian is removed
-    opacity_weight: float = 0.01  # of the mean opacity, in the loss
+    every: Count = 100
+    faded: Factor = 0.02  # opacity below which a Gaussian is removed
+    opacity_weight: NotNegative = 0.01  # of the mean opacity, in the loss
 
     def penalty(self, model: Gaussians, extent: float) -> Float[Tensor, ""]:
         return self.opacity_weight * model.opacity.mean()
@@ -87,11 +92,11 @@ class Adaptive(AbstractDensification):
 
 @dataclass(frozen=True, kw_only=True)
 class Relocation(AbstractDensification):
-    every: int = 100
-    faded: float = 0.005  # opacity below which a Gaussian moves elsewhere
-    opacity_weight: float = 0.01  # of the mean opacity, in the loss
-    scale_weight: float = 0.03  # of the mean scale over the extent of the scene, in the loss
-    noise: float = 8e4  # of the random steps: sigma = noise * step size * Sigma / extent
+    every: Count = 100
+    faded: Factor = 0.005  # opacity below which a Gaussian moves elsewhere
+    opacity_weight: NotNegative = 0.01  # of the mean opacity, in the loss
+    scale_weight: NotNegative = 0.03  # of the mean scale over the extent of the scene, in the loss
+    noise: NotNegative = 8e4  # of the random steps: sigma = noise * step size * Sigma / extent
 
     def penalty(self, model: Gaussians, extent: float) -> Float[Tensor, ""]:
         return (

@@ -8,21 +8,27 @@ H = F - I, so that float32 keeps small strains. The solver never asks which mode
 import abc
 import functools
 import math
+import re
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import torch
 import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from physics3d.checks import PoissonsRatio, Positive, complaint
 from physics3d.materials import spectral
 
+ELASTIC = {"youngs_modulus": Positive, "poissons_ratio": PoissonsRatio}
 Values = dict[str, Tensor]  # physical name -> scalar or one number per particle, SI
 
 
 @dataclass(frozen=True, kw_only=True)
 class AbstractMaterial(abc.ABC):
     """A constitutive model. Its fields choose the model; its parameters are the numbers that one learns."""
+
+    RANGES: ClassVar[dict[str, Any]] = {}  # parameter -> what it may be, SI; of further branches (_2, _3) likewise
 
     @property
     @abc.abstractmethod
@@ -46,9 +52,11 @@ class AbstractMaterial(abc.ABC):
         """
         return values
 
-    @abc.abstractmethod
     def check_parameters(self, values: Values) -> None:
         """Raise ValueError naming the parameter, its value and the remedy."""
+        check_names(values, self.parameters)
+        for name in self.parameters:
+            check_range(values[name], self.RANGES[re.sub(r"_[23]$", "", name)], name)
 
     @abc.abstractmethod
     def coefficients(self, values: Values) -> Float[Tensor, "k n"]:
@@ -149,20 +157,13 @@ def check_names(values: Values, parameters: tuple[str, ...]) -> None:
         raise ValueError(f"material parameters: missing {sorted(missing)}, unknown {sorted(unknown)}; needed: {need}")
 
 
-def check_range(values: Values, name: str, lowest: float, highest: float = math.inf, *, closed: bool = False) -> None:
-    """Raise ValueError unless lowest < values[name] < highest (closed: <=); NaN never passes."""
-    value = torch.as_tensor(values[name]).detach()
-    good = (value >= lowest) & (value <= highest) if closed else (value > lowest) & (value < highest)
-    if not bool(good.all()):
-        worst = value[~good].flatten()[0].item()
-        less = "<=" if closed else "<"
-        raise ValueError(f"{name} is {worst:g}; take {lowest:g} {less} {name} {less} {highest:g}")
-
-
-def check_elastic(values: Values) -> None:
-    """Raise ValueError unless youngs_modulus [Pa] is positive and poissons_ratio lies in (-1, 0.5)."""
-    check_range(values, "youngs_modulus", 0.0)
-    check_range(values, "poissons_ratio", -1.0, 0.5)
+def check_range(value: Tensor, allowed: Any, name: str) -> None:
+    """Raise ValueError unless every number in `value` is what the hint `allowed` says; NaN never is."""
+    value = torch.as_tensor(value).detach()
+    for extreme in (value.amin(), value.amax()) if value.numel() else ():
+        wrong = complaint(allowed, float(extreme), name)
+        if wrong:
+            raise ValueError(wrong)
 
 
 def lame(youngs_modulus: Tensor, poissons_ratio: Tensor) -> tuple[Tensor, Tensor]:

@@ -11,9 +11,11 @@ elastic strain X = b_e - I lives in the memory, so that H is the total deformati
 import functools
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 import warp as wp
+from annotated_types import Gt, Lt
 from jaxtyping import Float
 from torch import Tensor
 
@@ -23,6 +25,8 @@ from physics3d.materials import base, spectral
 @dataclass(frozen=True, kw_only=True)
 class DruckerPrager(base.AbstractMaterial):
     """Parameters: youngs_modulus [Pa], poissons_ratio, friction_angle [rad]."""
+
+    RANGES = base.ELASTIC | {"friction_angle": Annotated[float, Gt(0), Lt(math.pi / 2)]}
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -35,11 +39,6 @@ class DruckerPrager(base.AbstractMaterial):
     @property
     def memory_rows(self) -> int:
         return 7
-
-    def check_parameters(self, values: base.Values) -> None:
-        base.check_names(values, self.parameters)
-        base.check_elastic(values)
-        base.check_range(values, "friction_angle", 0.0, math.pi / 2)
 
     def coefficients(self, values: base.Values) -> Float[Tensor, "3 n"]:
         self.check_parameters(values)

@@ -17,11 +17,14 @@ Computational Inelasticity (1998), sec. 1.7 and 2.7 (overstress); Yue et al. (20
 import functools
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import warp as wp
+from annotated_types import Gt, Lt
 from jaxtyping import Float
 from torch import Tensor
 
+from physics3d.checks import Positive
 from physics3d.materials import base, spectral
 
 
@@ -29,6 +32,12 @@ from physics3d.materials import base, spectral
 class HerschelBulkley(base.AbstractMaterial):
     """Parameters: youngs_modulus [Pa], poissons_ratio, yield_stress tau_y [Pa] in shear, consistency k [Pa s^n],
     flow_index n (below 1: the faster, the thinner)."""
+
+    RANGES = base.ELASTIC | {
+        "yield_stress": Positive,
+        "consistency": Positive,
+        "flow_index": Annotated[float, Gt(0), Lt(2)],
+    }
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -47,13 +56,6 @@ class HerschelBulkley(base.AbstractMaterial):
     @property
     def memory_rows(self) -> int:
         return 6
-
-    def check_parameters(self, values: base.Values) -> None:
-        base.check_names(values, self.parameters)
-        base.check_elastic(values)
-        base.check_range(values, "yield_stress", 0.0)
-        base.check_range(values, "consistency", 0.0)
-        base.check_range(values, "flow_index", 0.0, 2.0)
 
     def coefficients(self, values: base.Values) -> Float[Tensor, "5 n"]:
         self.check_parameters(values)

@@ -25,6 +25,8 @@ _FLOOR = 1e-4  # J
 class NeoHookean(base.AbstractMaterial):
     """Elastic; parameters youngs_modulus [Pa] and poissons_ratio."""
 
+    RANGES = base.ELASTIC
+
     @property
     def parameters(self) -> tuple[str, ...]:
         return ("youngs_modulus", "poissons_ratio")
@@ -32,10 +34,6 @@ class NeoHookean(base.AbstractMaterial):
     @property
     def example(self) -> dict[str, float]:
         return {"youngs_modulus": 1e5, "poissons_ratio": 0.4}  # soft rubber
-
-    def check_parameters(self, values: base.Values) -> None:
-        base.check_names(values, self.parameters)
-        base.check_elastic(values)
 
     def coefficients(self, values: base.Values) -> Float[Tensor, "2 n"]:
         self.check_parameters(values)

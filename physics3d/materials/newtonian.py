@@ -9,12 +9,15 @@ explicit step needs dt < rho dx^2 / (6 eta) besides the sound-speed limit. Bird,
 
 import functools
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 import warp as wp
+from annotated_types import Ge, Le
 from jaxtyping import Float
 from torch import Tensor
 
+from physics3d.checks import NotNegative, Positive
 from physics3d.materials import base, spectral
 
 _LEAST_RATE = 1e-3  # g_0 [1/s]
@@ -23,6 +26,8 @@ _LEAST_RATE = 1e-3  # g_0 [1/s]
 @dataclass(frozen=True, kw_only=True)
 class Newtonian(base.AbstractMaterial):
     """Parameters: bulk_modulus [Pa], viscosity k [Pa s^n], power_index n."""
+
+    RANGES = {"bulk_modulus": Positive, "viscosity": NotNegative, "power_index": Annotated[float, Ge(0), Le(2)]}
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -35,12 +40,6 @@ class Newtonian(base.AbstractMaterial):
     @property
     def memory_rows(self) -> int:
         return 1
-
-    def check_parameters(self, values: base.Values) -> None:
-        base.check_names(values, self.parameters)
-        base.check_range(values, "bulk_modulus", 0.0)
-        base.check_range(values, "viscosity", 0.0, closed=True)
-        base.check_range(values, "power_index", 0.0, 2.0, closed=True)
 
     def coefficients(self, values: base.Values) -> Float[Tensor, "3 n"]:
         self.check_parameters(values)

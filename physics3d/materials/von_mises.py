@@ -15,12 +15,15 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
+from physics3d.checks import NotNegative, Positive
 from physics3d.materials import base, spectral
 
 
 @dataclass(frozen=True, kw_only=True)
 class VonMises(base.AbstractMaterial):
     """Parameters: youngs_modulus [Pa], poissons_ratio, yield_stress [Pa] in tension, hardening_modulus [Pa]."""
+
+    RANGES = base.ELASTIC | {"yield_stress": Positive, "hardening_modulus": NotNegative}
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -33,12 +36,6 @@ class VonMises(base.AbstractMaterial):
     @property
     def memory_rows(self) -> int:
         return 7
-
-    def check_parameters(self, values: base.Values) -> None:
-        base.check_names(values, self.parameters)
-        base.check_elastic(values)
-        base.check_range(values, "yield_stress", 0.0)
-        base.check_range(values, "hardening_modulus", 0.0, closed=True)
 
     def coefficients(self, values: base.Values) -> Float[Tensor, "4 n"]:
         self.check_parameters(values)
