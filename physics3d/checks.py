@@ -98,6 +98,7 @@ class Corners:
     def __call__(self, values: Mapping[str, Any], where: str) -> str | None:
         low, high = _listed(values[self.lower]), _listed(values[self.upper])
         if (low is None) != (high is None):
+            low, high = ("null" if corner is None else corner for corner in (low, high))
             return f"{where}.{self.lower} is {low} and {self.upper} {high}; take both corners, or neither"
         least = 0 if self.apart is None else values[self.apart]
         if low is None or all(b - a >= least and b > a for a, b in zip(low, high, strict=True)):
