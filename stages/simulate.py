@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, TypeGuard
 
 import torch
 
@@ -81,7 +81,7 @@ def excited(
     return tuple(b for b in pushed if any(vector) or not _has_force(b))
 
 
-def _has_force(boundary: AbstractBoundary) -> bool:
+def _has_force(boundary: AbstractBoundary) -> TypeGuard[Impulse]:
     return isinstance(boundary, Impulse) and boundary.force is not None
 
 
