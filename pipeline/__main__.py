@@ -2,21 +2,26 @@
 
 Composes the configuration, says "up to date" if everything has been filed, else runs the flow under Prefect, records
 it in MLflow, and prints what came out. Nothing heavy is imported before it is needed. Exit codes: 0 done, 1 a stage
-failed, 2 the command line is wrong, 130 Ctrl-C.
+failed, 2 the command line is wrong, 130 interrupted by Ctrl-C or SIGTERM.
 """
 
 import logging
 import os
+import signal
 import sys
+import tempfile
 import time
 import warnings
 from pathlib import Path
 from typing import Any
 
+from pipeline.fingerprint import installed
 from pipeline.flow import execute, up_to_date
 from pipeline.report import report
 from pipeline.settings import CONF, GROUPS, SettingsError, choices, compose, described
 from pipeline.stage import Filed, StageError
+from pipeline.tracking import Tracking, address, git_commit, mend
+from pipeline.words import literal_paths
 
 USAGE = """\
 python -m pipeline [group=name ...] [key=value ...]      e.g. python -m pipeline scene=carnation profile=smoke
@@ -36,8 +41,9 @@ def main(words: list[str]) -> int:
     if "--help" in words or "-h" in words:
         print(usage())
         return 0
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        config, picked = compose([w for w in words if w != "--config"])
+        config, picked = compose(literal_paths([w for w in words if w != "--config"]))
         if "--config" in words:
             show(config)
             return 0
@@ -47,6 +53,8 @@ def main(words: list[str]) -> int:
     except StageError as error:
         return _fail(str(error), 1)
     except KeyboardInterrupt:
+        for name in (signal.SIGINT, signal.SIGTERM):  # once is enough; a second one ends what libraries do at the end
+            signal.signal(name, signal.SIG_DFL)
         print("\ninterrupted; finished stages are kept, the same command goes on from there", file=sys.stderr)
         return 130
     except Exception as error:
@@ -60,14 +68,14 @@ def run(config: dict[str, Any], picked: dict[str, str], started: float) -> int:
     output = Path(config["output"]).expanduser().resolve()
     shelf = output / "artifacts"
     verify = config["verify"]
+    mend(output)
     plan = up_to_date(config, shelf, verify)
     if plan is not None:
         report(plan, {step.name: True for step in plan.steps})
         print(f"up to date: all {len(plan.steps)} steps were computed before ({time.monotonic() - started:.1f} s)")
         return 0
 
-    from pipeline.tracking import Tracking, address, git_commit
-
+    _kernels(output)
     _quiet()
     hits: dict[str, bool] = {}
     tracking: Tracking | None = None
@@ -120,6 +128,25 @@ def show(config: dict[str, Any]) -> None:
     print(OmegaConf.to_yaml(config))
 
 
+def _kernels(output: Path) -> None:
+    """Keep compiled kernels below the output folder where the usual place may not be written.
+
+    Raises RuntimeError if a place was chosen that may not.
+    """
+    chosen = os.environ.get("WARP_CACHE_PATH")
+    usual = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "warp"
+    folder = Path(chosen or usual).expanduser() / (installed("warp") or "")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return
+    except OSError as error:
+        if chosen:
+            reason = f"compiled kernels cannot be kept in {chosen} ({error.strerror})"
+            raise RuntimeError(f"{reason}; set WARP_CACHE_PATH to a folder that can be written, or unset it") from error
+    os.environ["WARP_CACHE_PATH"] = str(output / ".warp")
+
+
 def _quiet() -> None:
     """Libraries talk to themselves; the person watching reads our lines."""
     import warp
@@ -127,7 +154,7 @@ def _quiet() -> None:
     warp.config.log_level = warp.LOG_ERROR
     warnings.filterwarnings("ignore", category=DeprecationWarning)
     warnings.filterwarnings("ignore", category=FutureWarning)
-    for name in ("prefect", "httpx", "alembic", "mlflow"):
+    for name in ("prefect", "httpx", "alembic", "mlflow", "matplotlib"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
 
 
