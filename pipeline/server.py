@@ -16,6 +16,7 @@ import time
 import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 
 HERE = ("localhost", "127.0.0.1", "::1")
@@ -75,9 +76,13 @@ def _allow_files() -> None:
 
 
 def _go_round_proxies() -> None:
+    proxies = [value for name, value in os.environ.items() if name.lower().endswith("_proxy")]
+    # httpx, which talks to the server and to the hub, refuses to start beside a SOCKS proxy that it cannot use
+    useless = any(value.startswith("socks") for value in proxies) and find_spec("socksio") is None
     for name in ("no_proxy", "NO_PROXY"):  # libraries read the one or the other
         listed = [entry.strip() for entry in os.environ.get(name, "").split(",") if entry.strip()]
-        os.environ[name] = ",".join([*listed, *(host for host in HERE if host not in listed)])
+        missing = [host for host in HERE if host not in listed]
+        os.environ[name] = "*" if useless else ",".join([*listed, *missing])
 
 
 def _start(log: Path) -> tuple[subprocess.Popen, str]:

@@ -6,7 +6,8 @@ is one warning, and the run goes on without.
 
 The database is made beside its place and renamed, under a lock: a kill while MLflow creates its tables, or two first
 runs at once, leave a whole one or none. MLflow stores where pictures lie as absolute addresses, and keeps a run whose
-process was killed as running; `mend`, before every run, corrects both. It needs no MLflow, only SQLite.
+process was killed as running; `mend`, before every run, corrects both, and sets aside what is no record. It needs no
+MLflow, only SQLite.
 
     python -m pipeline.tracking <output folder>        prints the address that compares runs, and serves it
 """
@@ -22,8 +23,8 @@ import sqlite3
 import subprocess
 import sys
 import time
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -65,8 +66,7 @@ class Tracking:
         from mlflow.tracking import MlflowClient
 
         logging.getLogger("mlflow").setLevel(logging.ERROR)
-        with (self.output / ".mlflow.lock").open("w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)  # the system takes it back from a dead process
+        with _lock(self.output):
             if not (self.output / "mlflow.db").exists():
                 _make(self.output)
             self.client = MlflowClient(database(self.output))
@@ -141,24 +141,55 @@ def mend(output: Path) -> None:
     if not file.exists():
         return
     try:
-        with closing(_connect(file, "rw")) as record, record:
-            query = "select experiment_id, artifact_location from experiments where name = ?"
-            for experiment, old in record.execute(query, (EXPERIMENT,)).fetchall():
-                new = _store(output)
-                if old != new:
-                    for table, column in (("experiments", "artifact_location"), ("runs", "artifact_uri")):
-                        record.execute(
-                            f"update {table} set {column} = ? || substr({column}, ?) "
-                            f"where experiment_id = ? and substr({column}, 1, ?) = ?",
-                            (new, len(old) + 1, experiment, len(old), old),
-                        )
-                query = "select run_uuid, value from runs join tags using (run_uuid) "
-                query += "where experiment_id = ? and status = 'RUNNING' and key = 'process'"
-                dead = [run for run, process in record.execute(query, (experiment,)).fetchall() if _gone(process)]
-                close = "update runs set status = 'KILLED', end_time = ? where run_uuid = ?"
-                record.executemany(close, [(int(time.time() * 1000), run) for run in dead])
-    except sqlite3.Error as error:
+        with _lock(output):
+            if not _is_record(file):
+                aside = file.with_name(f"mlflow.db.damaged-{time.strftime('%Y%m%d-%H%M%S')}")
+                file.rename(aside)
+                print(f"{'mlflow':>16} | warning: the record was damaged; it is kept as {aside}, and begun anew")
+                return
+            with closing(_connect(file, "rw")) as record, record:
+                query = "select experiment_id, artifact_location from experiments where name = ?"
+                for experiment, old in record.execute(query, (EXPERIMENT,)).fetchall():
+                    _move(record, experiment, old, _store(output))
+                    _close_dead(record, experiment)
+    except (OSError, sqlite3.Error) as error:
         _warn(error)
+
+
+def _is_record(file: Path) -> bool:
+    """Whether it has tables of MLflow; one that is busy, or not ours to read, counts as a record."""
+    if not file.is_file():
+        return False
+    try:
+        with closing(_connect(file, "ro")) as record:
+            record.execute("select 1 from experiments, runs, tags limit 1").fetchall()
+        return True
+    except sqlite3.DatabaseError as error:
+        return isinstance(error, sqlite3.OperationalError) and "no such table" not in str(error)
+
+
+def _move(record: sqlite3.Connection, experiment: int, old: str, new: str) -> None:
+    if old == new:
+        return
+    for table, column in (("experiments", "artifact_location"), ("runs", "artifact_uri")):
+        change = f"update {table} set {column} = ? || substr({column}, ?) "
+        change += f"where experiment_id = ? and substr({column}, 1, ?) = ?"
+        record.execute(change, (new, len(old) + 1, experiment, len(old), old))
+
+
+def _close_dead(record: sqlite3.Connection, experiment: int) -> None:
+    query = "select run_uuid, value from runs join tags using (run_uuid) "
+    query += "where experiment_id = ? and status = 'RUNNING' and key = 'process'"
+    dead = [run for run, process in record.execute(query, (experiment,)).fetchall() if _gone(process)]
+    close = "update runs set status = 'KILLED', end_time = ? where run_uuid = ?"
+    record.executemany(close, [(int(time.time() * 1000), run) for run in dead])
+
+
+@contextmanager
+def _lock(output: Path) -> Iterator[None]:
+    with (output / ".mlflow.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # the system takes it back from a dead process
+        yield
 
 
 def database(output: Path) -> str:
