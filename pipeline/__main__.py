@@ -5,6 +5,7 @@ it in MLflow, and prints what came out. Nothing heavy is imported before it is n
 failed, 2 the command line is wrong, 130 interrupted by Ctrl-C or SIGTERM.
 """
 
+import io
 import logging
 import os
 import signal
@@ -42,6 +43,9 @@ def main(words: list[str]) -> int:
         print(usage())
         return 0
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a name that this terminal cannot show must not end a run
+            stream.reconfigure(errors="backslashreplace")
     try:
         config, picked = compose(literal_paths([w for w in words if w != "--config"]))
         if "--config" in words:

@@ -11,9 +11,11 @@ import re
 import shlex
 import sys
 
+from pipeline.settings import SettingsError
+
 
 def literal_paths(words: list[str]) -> list[str]:
-    """The words, with the values that are paths quoted for Hydra. Raises ValueError for a line break in a path."""
+    """The words, with the values that are paths quoted for Hydra. Raises SettingsError for a line break in a path."""
     return [_literal(word) for word in words]
 
 
@@ -24,7 +26,7 @@ def _literal(word: str) -> str:
     from hydra.core.override_parser.types import Quote, QuotedString
 
     if set(value) & set("\n\r"):
-        raise ValueError(f"{key}={value!r}: a path with a line break is not supported; rename the file or folder")
+        raise SettingsError(f"{key}={value!r}: a path with a line break is not supported; rename the file or folder")
     # in what OmegaConf reads, a $ that is followed by a brace begins another entry's name, unless it is escaped
     text = re.sub(r"(\\*)\$\{", r"\1\1\\${", os.path.expanduser(value))
     return f"{key}={QuotedString(text=text, quote=Quote.double).with_quotes()}"
