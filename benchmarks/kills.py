@@ -3,8 +3,8 @@
     python benchmarks/kills.py [scene=carnation profile=smoke ...]        (make bench-kills; not a part of make bench)
 
 A run is killed with SIGKILL as soon as a stage has begun to write, and started again. It fails if a result that was
-finished is lost or computed twice, something half-done passes for finished, a Prefect server outlives its run, or MLflow
-shows a run as running whose process is gone.
+finished is lost or computed twice, if something half-done passes for finished, if a Prefect server outlives its run, or
+if MLflow shows a run as running whose process is gone.
 """
 
 import os

@@ -63,7 +63,8 @@ def test_what_is_left_out_says_the_time_it_took_elsewhere(tmp_path):
     for folder, seconds in (("a", 10.0), ("b", 20.0), ("c", 90.0)):
         place = tmp_path / "artifacts" / "segment" / folder
         place.mkdir(parents=True)
-        (place / "manifest.json").write_text(json.dumps({"seconds": seconds}))
+        told = {"stage": "segment", "fingerprint": folder, "seconds": seconds, "peak_rss_bytes": 1}
+        (place / "manifest.json").write_text(json.dumps(told | {"files": {"fields.json": [0, ""]}}))
     config["capture"]["single_object"] = True
     capture = first(config, tmp_path / "artifacts")
     run(capture, "cpu")
