@@ -8,6 +8,7 @@ failed, 2 the command line is wrong, 130 interrupted by Ctrl-C or SIGTERM.
 import io
 import logging
 import os
+import shutil
 import signal
 import sys
 import tempfile
@@ -35,6 +36,9 @@ Runs the pipeline on a scene; what has been computed before is reused. Keys are 
     verify=true                 check stored results by content, not only by size
     --help  --config            this text; the configuration as composed, without running
 """
+
+
+LEAST_SPACE = 10_000_000  # what Prefect and MLflow need for their databases [byte]
 
 
 def main(words: list[str]) -> int:
@@ -79,6 +83,9 @@ def run(config: dict[str, Any], picked: dict[str, str], started: float) -> int:
         print(f"up to date: all {len(plan.steps)} steps were computed before ({time.monotonic() - started:.1f} s)")
         return 0
 
+    output.mkdir(parents=True, exist_ok=True)
+    if _free(output) < LEAST_SPACE:  # the server would wait for its database, rather than end
+        raise StageError(_full(output))
     _kernels(output)
     _quiet()
     hits: dict[str, bool] = {}
@@ -100,6 +107,10 @@ def run(config: dict[str, Any], picked: dict[str, str], started: float) -> int:
     except KeyboardInterrupt:
         status = "KILLED"
         raise
+    except Exception as error:
+        if isinstance(error, StageError) or _free(output) > 1 << 20:
+            raise
+        raise StageError(_full(output)) from error  # the server, or a library, says anything but that
     finally:
         if tracking is not None:
             tracking.close(scores=scores, status=status)
@@ -135,7 +146,7 @@ def show(config: dict[str, Any]) -> None:
 def _kernels(output: Path) -> None:
     """Keep compiled kernels below the output folder where the usual place may not be written.
 
-    Raises RuntimeError if a place was chosen that may not.
+    Raises StageError if a place was chosen that may not.
     """
     chosen = os.environ.get("WARP_CACHE_PATH")
     usual = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "warp"
@@ -147,8 +158,18 @@ def _kernels(output: Path) -> None:
     except OSError as error:
         if chosen:
             reason = f"compiled kernels cannot be kept in {chosen} ({error.strerror})"
-            raise RuntimeError(f"{reason}; set WARP_CACHE_PATH to a folder that can be written, or unset it") from error
+            raise StageError(f"{reason}; set WARP_CACHE_PATH to a folder that can be written, or unset it") from error
     os.environ["WARP_CACHE_PATH"] = str(output / ".warp")
+
+
+def _free(output: Path) -> int:
+    """Space on the disk of a folder [byte]."""
+    return shutil.disk_usage(output).free
+
+
+def _full(output: Path) -> str:
+    free = f"{_free(output) / 1e6:.1f} MB are free in {output}"
+    return f"the disk is full ({free}); free some space or write elsewhere with output=<folder>"
 
 
 def _quiet() -> None:

@@ -403,7 +403,8 @@ def _told(made: Any) -> Iterator[tuple[str, Path]]:
             yield from _told(value)
     elif is_dataclass(made):
         if hasattr(made, "files"):
-            base = Path(made.path).absolute() if isinstance(getattr(made, "path", None), str) else None
+            place = getattr(made, "path", None)
+            base = Path(place).absolute() if isinstance(place, str) else None
             folder = base if base is None or base.is_dir() else base.parent
             for file in map(Path, made.files()):
                 yield os.path.relpath(file.absolute(), folder) if folder else file.name, file.absolute()
