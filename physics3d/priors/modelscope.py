@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from physics3d.priors.base import AbstractPrior, Level, x0_from
-from physics3d.priors.weights import load_pipeline
+from physics3d.priors.weights import load_pipeline, pipeline_files
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,6 +41,12 @@ class ModelScope(AbstractPrior):
             raise ValueError(f"prior.height x prior.width is {self.height} x {self.width}; both must be multiples of 8")
         if not 0 <= self.time[0] <= self.time[1] <= 1:
             raise ValueError(f"prior.time is {self.time}; give 0 <= lowest <= highest <= 1")
+
+    def files(self) -> tuple[str, ...]:
+        """Of the weights, fetched if they are not on this machine: part of the fingerprint of what is learned."""
+        from diffusers.pipelines.deprecated.text_to_video_synthesis import TextToVideoSDPipeline
+
+        return pipeline_files(TextToVideoSDPipeline, self.model, key="prior.model", variant=self.variant)
 
     @cached_property
     def pipeline(self) -> Any:

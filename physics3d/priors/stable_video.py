@@ -22,7 +22,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from physics3d.priors.base import AbstractPrior, Level, x0_from
-from physics3d.priors.weights import load_pipeline
+from physics3d.priors.weights import load_pipeline, pipeline_files
 
 
 class ImageCondition(NamedTuple):
@@ -51,6 +51,12 @@ class StableVideo(AbstractPrior):
             raise ValueError(f"prior.height x prior.width is {self.height} x {self.width}; both must be multiples of 8")
         if not 0 < self.sigma[0] <= self.sigma[1]:
             raise ValueError(f"prior.sigma is {self.sigma}; give 0 < lowest <= highest")
+
+    def files(self) -> tuple[str, ...]:
+        """Of the weights, fetched if they are not on this machine: part of the fingerprint of what is learned."""
+        from diffusers import StableVideoDiffusionPipeline
+
+        return pipeline_files(StableVideoDiffusionPipeline, self.model, key="prior.model", variant=self.variant)
 
     @cached_property
     def pipeline(self) -> Any:

@@ -27,6 +27,10 @@ class Sam2(AbstractMasker):
     most_points: int = 8
     device: str = "cpu"
 
+    def files(self) -> tuple[str, ...]:
+        """The weights, fetched if they are not on this machine: part of the fingerprint of the segmentation."""
+        return (str(sam2_weights(self.weights)),)
+
     def __call__(self, image, *, box, positive, negative):
         return self._predict(image, box, positive, negative, None)
 
@@ -107,7 +111,10 @@ class Sam2Video(AbstractVideoMasker):
 
         with TemporaryDirectory() as folder:  # it reads frames from files only
             for i, image in enumerate(images):
-                cv2.imwrite(f"{folder}/{i}.jpg", image[..., ::-1], (cv2.IMWRITE_JPEG_QUALITY, 97))
+                if not cv2.imwrite(f"{folder}/{i}.jpg", image[..., ::-1], (cv2.IMWRITE_JPEG_QUALITY, 97)):
+                    raise OSError(
+                        f"cannot write photographs for SAM 2 to {folder}; is the disk full? (TMPDIR=<folder>)"
+                    )
             state = self.still.model.init_state(folder)
         self.still.model.add_new_mask(state, start, 1, mask)
         found: dict[int, np.ndarray] = {}
