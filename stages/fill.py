@@ -6,6 +6,7 @@ import torch
 
 from physics3d.filling.body import Body
 from physics3d.filling.fill import fill
+from physics3d.filling.section import thinnest_section
 from physics3d.filling.slices import slices
 from physics3d.filling.solids import AbstractSolid, Poisson
 from physics3d.gaussians.model import Gaussians
@@ -24,7 +25,7 @@ class Fill:
     sheet_thickness: float | None = None  # of petals and leaves [m]; null: from the flatness of their Gaussians
     isolated: str = "attach"  # attach | drop | keep: what becomes of pieces more than a cell away from the rest
     drop_pieces_below: float = 0.01  # isolated pieces with less than this share of the volume are dropped
-    attach: str = "auto"  # auto | none: hold what touches static Gaussians, where the scene names no fixed region
+    attach: str = "auto"  # auto | none: whether what touches static Gaussians is held there
 
     def __call__(self, capture: Capture, gaussians: Gaussians, segmentation: Segmentation | None, *, log: Log) -> Body:
         """Without a segmentation everything visible moves. Raises ValueError if nothing does."""
@@ -57,6 +58,11 @@ class Fill:
         log.metric("particles_interior", int(body.interior.sum()))
         log.metric("volume", float(body.volume.double().sum()))
         log.info(f"{len(body.position)} particles, {float(body.volume.double().sum()):.4g} m^3")
+        if body.attached is not None:
+            position, volume = body.position.double().numpy(), body.volume.double().numpy()
+            section = thinnest_section(position, volume, body.attached.numpy(), body.spacing)
+            if section is not None:
+                log.info(section.described())
         if log.folder is not None:
             log.image("slices", slices(gaussians, label, body))
         return body

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from physics3d.filling.body import Body
+from physics3d.filling.in_world import look_ahead
 from physics3d.gaussians.model import Gaussians
 from physics3d.learning.chain import chain_of
 from physics3d.learning.curves import curves
@@ -73,6 +74,7 @@ class Learn:
                 f"capture {capture.name} has no take with role learn; leave out the learning, or record a motion"
             )
         start = self.world.estimate()
+        look_ahead(body, self.world, take.excitation, log)
         indices = self.indices(take)
         seconds = int(indices[-1]) / take.fps
         field = GlobalField(

@@ -74,6 +74,8 @@ class Render:
             write_mp4(log.path(f"{name}.mp4"), video, trajectory.fps)
             log.image(f"{name}_frames", contact_sheet(video))
             log.image(f"{name}_space_time", space_time_slice(video, row=video.shape[1] // 2))
+        for name, camera in cameras.items():
+            _report_motion(name, camera, trajectory, log)
         log.info(f"{count} frames from {len(frames)} camera(s): {', '.join(f'{name}.mp4' for name in frames)}")
         return Video(frames=tuple(frames.values()), names=tuple(frames), fps=trajectory.fps)
 
@@ -112,3 +114,20 @@ class Render:
         if not 0 <= view < len(capture.cameras):
             raise ValueError(f"render.view is {view}; the capture has views 0 to {len(capture.cameras) - 1}")
         return {"view": capture.cameras[view].scaled(self.scale)}
+
+
+def _report_motion(name: str, camera: Camera, trajectory: Trajectory, log: Log) -> None:
+    """Say by how many pixels the body moves in the picture, and warn if nobody will see it."""
+    first, depth = camera.project(trajectory.position[0])
+    farthest = torch.zeros(len(first))
+    for x in trajectory.position:
+        uv, z = camera.project(x)
+        moved = (uv - first).norm(dim=1)
+        farthest = torch.maximum(farthest, torch.where((z > 0) & (depth > 0), moved, 0.0).to(farthest))
+    most = float(farthest.max())
+    log.metric(f"{name}/moved", most)
+    text = f"{name}: the body moves by up to {most:.2g} pixels"
+    if most < 1:
+        log.warn(f"{text}, which nobody sees; take a larger simulate.force, a softer material or a larger render.scale")
+    else:
+        log.info(text)

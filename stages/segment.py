@@ -72,12 +72,9 @@ class Segment:
                     f"no Gaussian belongs to {part!r}; correct segment.prompts, see the previews of segment"
                 )
         log.info(f"{int(apart.sum())} Gaussians of small islands went back to static")
-        log.info(
-            f"{int(touch.sum())} moving Gaussians lie next to static ones"
-            + ("; the body is attached there" if touch.any() else "; nothing holds the body")
-        )
+        log.info(f"{int(touch.sum())} moving Gaussians lie next to static ones")
         log.metric("islands", int(apart.sum()))
-        log.metric("attached", int(touch.sum()))
+        log.metric("beside_static", int(touch.sum()))
         self._show(capture, gaussians, label, log)
 
         masks = None

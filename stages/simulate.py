@@ -9,6 +9,7 @@ import torch
 from physics3d.boundaries.base import AbstractBoundary
 from physics3d.boundaries.impulse import Impulse
 from physics3d.filling.body import Body
+from physics3d.filling.in_world import look_ahead
 from physics3d.log import Log
 from physics3d.mpm.rollout import rollout
 from physics3d.trajectory import Trajectory
@@ -30,6 +31,8 @@ class Simulate:
         """Raises ValueError as `rollout` does, or if fps is not a rate above 0."""
         if not 0 < self.fps < math.inf:
             raise ValueError(f"simulate.fps is {self.fps}; take a rate above 0 1/s")
+        excitation = excited(self.excitation, self.force)
+        look_ahead(body, self.world, excitation, log)
         with torch.no_grad():
             trajectory = rollout(
                 self.world,
@@ -37,7 +40,7 @@ class Simulate:
                 body.position,
                 body.volume,
                 velocity=estimate.velocity,
-                excitation=(*body.held(self.world.boundaries), *excited(self.excitation, self.force)),
+                excitation=(*body.held, *excitation),
                 frames=self.frames,
                 frame_dt=1 / self.fps,
                 device=self.device,
@@ -90,6 +93,10 @@ def _report(trajectory: Trajectory, log: Log) -> None:
     worst = int(max(health["inverted"]))
     if worst:
         log.warn(f"up to {worst} particles are turned inside out; take a smaller cfl, a smaller dx or a weaker force")
+    moved = float((trajectory.position - trajectory.rest_position).norm(dim=2).max())
+    size = float((trajectory.rest_position.amax(0) - trajectory.rest_position.amin(0)).max())
+    log.metric("moved", moved)
+    log.info(f"it moves by at most {1e3 * moved:.3g} mm, {100 * moved / max(size, 1e-12):.2g} % of its size")
     lonely = int(health["isolated"][0])
     if lonely:
         log.warn(f"{lonely} particles have no neighbour within a cell and move alone; fill more densely or enlarge dx")

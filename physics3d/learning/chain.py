@@ -53,7 +53,7 @@ def chain_of(
             rest,
             volume,
             velocity=field.velocity(theta),
-            excitation=(*body.held(world.boundaries), *take.excitation),
+            excitation=(*body.held, *take.excitation),
             frames=len(indices),
             frame_dt=int(indices[1]) / take.fps,
             device=device,
