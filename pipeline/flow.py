@@ -12,10 +12,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from pipeline.page import STAGES
 from pipeline.server import server
-from pipeline.stage import Filed, Part, Step, Unknown, as_task, build, damage, peek, usual_seconds
-
-STAGES = ("capture", "guess", "reconstruct", "segment", "fill", "learn", "simulate", "render", "evaluate")
+from pipeline.stage import Filed, Part, StageError, Step, Unknown, as_task, build, damage, load, peek, usual_seconds
 
 
 @dataclass(frozen=True)
@@ -100,10 +99,15 @@ def execute(
 ) -> tuple[Plan, list[Filed]]:
     """Run the graph under Prefect; `done` is called after each step. Raises StageError with one line."""
 
+    stages: dict[str, Any] = {}
+
     def check() -> None:
         """Build every stage once, so that a bad value is found before hours of work, not after."""
-        for name in STAGES:
-            build(config.get(name), device, name)
+        try:
+            stages.update({name: build(config.get(name), device, name) for name in STAGES})
+        except ValueError as error:
+            raise StageError(str(error)) from error
+        suit(stages, getattr(getattr(stages["capture"], "source", None), "outline", None), {})
 
     with server(home, meanwhile=check):
         from prefect import flow
@@ -119,6 +123,7 @@ def execute(
             capture = first(config, shelf)
             compute(capture)
             whole = plan(config, capture)
+            suit(stages, getattr(load(capture, device), "outline", None), whole.left_out)
             for name, why in whole.left_out.items():
                 print(f"{name:>16} | left out: {why}", flush=True)
             for step in whole.steps[1:]:
@@ -126,6 +131,16 @@ def execute(
             return whole, list(filed.values())
 
         return physics3d()
+
+
+def suit(stages: dict[str, Any], outline: Any, left_out: dict[str, str]) -> None:
+    """Raise StageError if a stage cannot take a capture of this outline: before the work on it, not after."""
+    for name, stage in stages.items():
+        if outline is not None and name not in left_out and hasattr(stage, "fits"):
+            try:
+                stage.fits(outline)
+            except ValueError as error:
+                raise StageError(f"{name}: {error}") from error
 
 
 def _steps(inputs: Any) -> list[Step]:

@@ -37,7 +37,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from physics3d.boundaries import base
-from physics3d.boundaries.half_space import KINDS, coulomb
+from physics3d.boundaries.half_space import Kind, coulomb
+from physics3d.checks import Lasting, NotNegative, Positive, Time
 from physics3d.open3d_import import open3d
 from physics3d.warp_types import matrix, vector, vector4
 
@@ -54,17 +55,18 @@ class MeshCollider(base.AbstractBoundary):
     path: str | None = None  # .obj, .ply or .stl
     vertices: Float[Tensor, "n 3"] | tuple[base.Vector, ...] | None = None
     triangles: Int[Tensor, "m 3"] | tuple[tuple[int, int, int], ...] | None = None  # rows of `vertices`
-    scale: float = 1.0  # of the mesh's coordinates to metres
+    scale: Positive = 1.0  # of the mesh's coordinates to metres
     rotation: base.Vector = (0.0, 0.0, 0.0)  # about the mesh's origin: axis times angle [rad]
     position: base.Vector = (0.0, 0.0, 0.0)  # of the mesh's origin [m]
     velocity: base.Vector = (0.0, 0.0, 0.0)  # [m/s]
     angular_velocity: base.Vector = (0.0, 0.0, 0.0)  # about `position`, which travels along [rad/s]
-    start: float = 0.0  # [s]
-    duration: float = math.inf  # [s]
-    kind: str = "sticky"
-    friction: float = 0.0  # Coulomb coefficient, for slip and separate
+    start: Time = 0.0  # [s]
+    duration: Lasting = math.inf  # [s]
+    kind: Kind = "sticky"
+    friction: NotNegative = 0.0  # Coulomb coefficient, for slip and separate
 
     def check(self) -> None:
+        super().check()
         if self.path is None:
             for field in ("vertices", "triangles"):
                 base.require(getattr(self, field) is not None, self, field, "vertices with triangles, or a path")
@@ -74,11 +76,6 @@ class MeshCollider(base.AbstractBoundary):
             base.require(self.triangles is None, self, "triangles", "none beside a path")
             base.require(Path(self.path).suffix.lower() in SUFFIXES, self, "path", f"a file of {SUFFIXES}")
             base.require(Path(self.path).is_file(), self, "path", "a file that exists")
-        base.require_finite(self, "scale", "rotation", "position", "velocity", "angular_velocity", "friction")
-        base.require(self.scale > 0, self, "scale", "a factor above 0")
-        base.require(self.kind in KINDS, self, "kind", f"one of {KINDS}")
-        base.require(self.friction >= 0, self, "friction", "a coefficient >= 0")
-        base.require_window(self)
 
     def parameters(self, setting: base.Setting) -> Float[Tensor, " k"]:
         """Corner of the samples (3) [m], 1/h [1/m], samples along each axis (3), friction, the largest phi of a node of

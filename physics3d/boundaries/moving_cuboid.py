@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from physics3d.boundaries import base
+from physics3d.checks import Corners, Duration, Time
 from physics3d.warp_types import vector
 
 
@@ -22,13 +23,10 @@ class MovingCuboid(base.AbstractBoundary):
     lower: base.Vector
     upper: base.Vector
     velocity: base.Vector
-    start: float = 0.0
-    duration: float
+    start: Time = 0.0
+    duration: Duration
 
-    def check(self) -> None:
-        base.require_box(self)
-        base.require_finite(self, "velocity")
-        base.require_window(self)
+    RULES = (Corners("lower", "upper"),)
 
     def parameters(self, setting: base.Setting) -> Float[Tensor, "9"]:
         slack = 1e-3 * setting.dx  # a node on the surface belongs to the block whatever the rounding

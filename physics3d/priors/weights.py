@@ -1,9 +1,11 @@
 """Where published weights come from: a local folder, else the hub's cache, else the hub, else one clear message."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
+
+Precision = Literal["float16", "bfloat16", "float32"]
 
 
 def load_pipeline(kind: Any, name: str, *, key: str, dtype: torch.dtype, variant: str | None) -> Any:

@@ -12,6 +12,26 @@ from physics3d.gaussians.model import Gaussians
 
 
 @dataclass(frozen=True, kw_only=True)
+class Footage:
+    """How long a take is."""
+
+    name: str
+    role: str
+    frames: int
+    fps: float  # [1/s]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outline:
+    """What can be said of a capture before it is read; None: only reading it tells."""
+
+    name: str = "the capture"
+    names: tuple[str, ...] | None = None  # of the photographs
+    mattes: bool | None = None
+    takes: tuple[Footage, ...] | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
 class Take:
     """One recorded motion, seen by one or more fixed cameras at the same instants; frame 0 is the rest state."""
 
@@ -24,6 +44,10 @@ class Take:
     ]  # uint8 [t, h, w, 3], one per camera, composited on Capture.background where there is a matte
     excitation: tuple[AbstractBoundary, ...] = ()  # what set it in motion (a poke); gravity and floors are in the World
     held_out_cameras: tuple[int, ...] = ()  # cameras used by evaluation only, although the take is learned from
+
+    @property
+    def footage(self) -> Footage:
+        return Footage(name=self.name, role=self.role, frames=len(self.videos[0]), fps=self.fps)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,6 +95,11 @@ class Capture(AbstractArtifact):
                     f"take {take.name}: role {take.role!r} must be learn or evaluate, with one video per camera"
                 )
 
+    @property
+    def outline(self) -> Outline:
+        takes = tuple(take.footage for take in self.takes)
+        return Outline(name=self.name, names=self.names, mattes=bool(self.alphas), takes=takes)
+
     def take(self, role: str) -> Take | None:
         """The first take of that role, or None."""
         return next((t for t in self.takes if t.role == role), None)
@@ -86,6 +115,11 @@ class AbstractSource:
     def files(self) -> tuple[str, ...]:
         """Every file that the capture depends on; none for a scene made by code."""
         raise NotImplementedError
+
+    @property
+    def outline(self) -> Outline:
+        """What is known without reading anything: stages that cannot take it are refused before the work begins."""
+        return Outline()
 
     def __call__(self, *, log) -> Capture:
         raise NotImplementedError

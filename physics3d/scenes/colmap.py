@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from physics3d.checks import Colour, Direction, Every, Factor, Positive, Text
 from physics3d.gaussians.cameras import Camera
 from physics3d.scenes.axes import Axes, rigid_inverse
 from physics3d.scenes.base import AbstractSource, Capture
@@ -32,14 +33,14 @@ LARGEST_SHIFT = 0.5  # of a pixel by ignored distortion [px]
 
 @dataclass(frozen=True, kw_only=True)
 class ColmapSource(AbstractSource):
-    name: str
-    path: str  # the folder that holds sparse/0 and images
-    up: tuple[float, float, float]  # up in COLMAP's arbitrary coordinates; often near (0, -1, 0)
-    scale: float  # metres per COLMAP unit [m]; measure one known length
-    only: str = "*"  # pattern of the image names to use, e.g. "viewm0/*"; points then come from these images only
-    held_out_every: int = 8  # every so many images are kept for evaluation; 0: none
-    resolution: float | None = None  # factor on both image sides, in (0, 1]
-    background: tuple[float, float, float] = (1.0, 1.0, 1.0)  # put behind images with alpha, 0..1
+    name: Text
+    path: Text  # the folder that holds sparse/0 and images
+    up: Direction  # up in COLMAP's arbitrary coordinates; often near (0, -1, 0)
+    scale: Positive  # metres per COLMAP unit [m]; measure one known length
+    only: Text = "*"  # pattern of the image names to use, e.g. "viewm0/*"; points then come from these images only
+    held_out_every: Every = 8  # every so many images are kept for evaluation; 0: none
+    resolution: Factor | None = None  # factor on both image sides, in (0, 1]
+    background: Colour = (1.0, 1.0, 1.0)  # put behind images with alpha, 0..1
     single_object: bool = False  # one object on a plain background: nothing to segment
 
     def files(self) -> tuple[str, ...]:

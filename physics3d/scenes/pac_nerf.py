@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from physics3d.checks import Colour, Factor, Positive, Text, Whole
 from physics3d.gaussians.cameras import Camera
 from physics3d.scenes.axes import OPENGL_TO_OPENCV, Axes, rigid_inverse
 from physics3d.scenes.base import AbstractSource, Capture, Take
@@ -24,14 +25,14 @@ from physics3d.scenes.photographs import mattes, read_photograph, require_folder
 
 @dataclass(frozen=True, kw_only=True)
 class PacNerfSource(AbstractSource):
-    name: str
-    path: str  # the folder that holds all_data.json and data/
+    name: Text
+    path: Text  # the folder that holds all_data.json and data/
     truth: dict[str, float]  # material parameters as reported, SI; {} if unknown
     truth_source: str = ""  # who reports them, and what others recovered
-    held_out_cameras: tuple[int, ...] = ()  # positions among the cameras in order; for evaluation only
-    resolution: float | None = None  # factor on both image sides, in (0, 1]
-    background: tuple[float, float, float] = (1.0, 1.0, 1.0)  # put behind the mattes, 0..1
-    scale: float = 1.0  # metres per unit [m]
+    held_out_cameras: tuple[Whole, ...] = ()  # positions among the cameras in order; for evaluation only
+    resolution: Factor | None = None  # factor on both image sides, in (0, 1]
+    background: Colour = (1.0, 1.0, 1.0)  # put behind the mattes, 0..1
+    scale: Positive = 1.0  # metres per unit [m]
 
     def files(self) -> tuple[str, ...]:
         file, entries = self._read()

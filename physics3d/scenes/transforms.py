@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from physics3d.checks import Colour, Direction, Every, Factor, Positive, Text
 from physics3d.gaussians.cameras import Camera
 from physics3d.scenes.axes import OPENGL_TO_OPENCV, Axes, rigid_inverse
 from physics3d.scenes.base import AbstractSource, Capture
@@ -26,13 +27,13 @@ DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 @dataclass(frozen=True, kw_only=True)
 class TransformsSource(AbstractSource):
-    name: str
-    path: str  # the .json file, or the folder that holds transforms.json
-    up: tuple[float, float, float]  # up in the file's coordinates; NeRF-synthetic has (0, 0, 1)
-    scale: float  # metres per unit of the file [m]
-    held_out_every: int = 8  # every so many images are kept for evaluation; 0: none
-    resolution: float | None = None  # factor on both image sides, in (0, 1]
-    background: tuple[float, float, float] = (1.0, 1.0, 1.0)  # put behind images with alpha, 0..1
+    name: Text
+    path: Text  # the .json file, or the folder that holds transforms.json
+    up: Direction  # up in the file's coordinates; NeRF-synthetic has (0, 0, 1)
+    scale: Positive  # metres per unit of the file [m]
+    held_out_every: Every = 8  # every so many images are kept for evaluation; 0: none
+    resolution: Factor | None = None  # factor on both image sides, in (0, 1]
+    background: Colour = (1.0, 1.0, 1.0)  # put behind images with alpha, 0..1
     single_object: bool = False  # one object on a plain background: nothing to segment
 
     def files(self) -> tuple[str, ...]:

@@ -7,9 +7,12 @@ and which way is up (`up`, in the axes of the first run).
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Ge, Le
 
+from physics3d.checks import Colour, Direction, Every, Length, Pixels, Seed, Text, require_fields
 from physics3d.scenes.base import AbstractSource, Capture
 from physics3d.scenes.colmap import ColmapSource
 from physics3d.scenes.sfm import Solved, solve
@@ -20,16 +23,17 @@ VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 
 @dataclass(frozen=True, kw_only=True)
 class UnposedSource(AbstractSource):
-    name: str
-    path: str  # folder of photographs, or a video file
-    camera_distance: float  # of the cameras from what they look at, in the middle [m]; this sets the size of everything
-    frames: int = 60  # taken from a video: the sharpest of each of so many stretches; a folder is used whole
-    longest_side: int = 1200  # photographs are reduced to this [px]
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # correction: what is up, in the axes that were guessed
-    held_out_every: int = 8  # every so many images are kept for evaluation; 0: none
-    background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    name: Text
+    path: Text  # folder of photographs, or a video file
+    camera_distance: Length  # of the cameras from what they look at, in the middle [m]; sets the size of everything
+    # taken from a video: the sharpest of each of so many stretches; a folder is used whole
+    frames: Annotated[int, Ge(3), Le(100_000)] = 60
+    longest_side: Annotated[Pixels, Ge(64)] = 1200  # photographs are reduced to this [px]
+    up: Direction = (0.0, 0.0, 1.0)  # correction: what is up, in the axes that were guessed
+    held_out_every: Every = 8  # every so many images are kept for evaluation; 0: none
+    background: Colour = (1.0, 1.0, 1.0)
     single_object: bool = False  # one object on a plain background: nothing to segment
-    seed: int = 0
+    seed: Seed = 0
 
     def files(self) -> tuple[str, ...]:
         path = Path(self.path)
@@ -64,14 +68,8 @@ class UnposedSource(AbstractSource):
         return replace(capture, note=f"{len(solved.placed)} photographs placed by structure from motion; {said}")
 
     def check(self) -> None:
-        if not 0 < self.camera_distance < float("inf"):
-            raise ValueError(
-                f"camera_distance is {self.camera_distance}; give the distance the photographs were taken from [m]"
-            )
-        if self.frames < 3:
-            raise ValueError(f"frames is {self.frames}; take at least 3 of the video, better 60")
-        if self.longest_side < 64:
-            raise ValueError(f"longest_side is {self.longest_side} px; it must be at least 64, better 1200")
+        """Raise ValueError naming field, value and remedy."""
+        require_fields(self, "source")
 
     def _report(self, solved: Solved, log) -> None:
         total = len(solved.placed) + len(solved.lost)

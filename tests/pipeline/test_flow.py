@@ -11,8 +11,10 @@ from pathlib import Path
 import pytest
 from toy import ALL, configuration
 
-from pipeline.flow import first, plan
-from pipeline.stage import run
+from pipeline.flow import first, plan, suit
+from pipeline.page import STAGES
+from pipeline.settings import compose
+from pipeline.stage import StageError, build, run
 from pipeline.tracking import EXPERIMENT, address, flatten
 
 ROOT = Path(__file__).resolve().parent.parent.parent
@@ -70,6 +72,22 @@ def test_what_is_left_out_says_the_time_it_took_elsewhere(tmp_path):
     run(capture, "cpu")
     # the median of the three
     assert "20 s" in plan(config, capture).left_out["segment"]
+
+
+@pytest.mark.parametrize(
+    "word, message",
+    [
+        ("learn.frames=31", r"learn: learn\.frames is 31, but take learn has 30 frames; lower it"),
+        ("scene.prompts.0.view=view_040", r"segment: prompt: view 'view_040' is not in carnation; .*view_000"),
+        ("scene.prompts=[]", r"segment: segment\.prompts is empty and carnation has no mattes"),
+    ],
+)
+def test_a_stage_that_cannot_take_the_scene_is_refused_before_the_scene_is_made(word, message):
+    config, _ = compose(["scene=carnation", word])
+    stages = {name: build(config[name], "cpu", name) for name in STAGES}
+    with pytest.raises(StageError, match=message):
+        suit(stages, stages["capture"].source.outline, {})
+    suit(stages, stages["capture"].source.outline, {"learn": "left out", "segment": "left out"})
 
 
 def test_initial_material_is_simulated_without_what_was_learned(tmp_path):
