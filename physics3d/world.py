@@ -11,13 +11,11 @@ from torch import Tensor
 from physics3d.artifact import AbstractArtifact, require_finite
 from physics3d.boundaries.base import AbstractBoundary, Vector
 from physics3d.checks import Corners, Count, Factor, Length, MayBeInfinite, NotNegative, Positive, require_fields
-from physics3d.log import Log
 from physics3d.materials.base import AbstractMaterial
+from physics3d.materials.parameters import check_old_names
 
 Bytes = Annotated[int, Ge(0)]
 Parameter = Annotated[float, MayBeInfinite()]  # its range is that of the material
-CELLS_ACROSS = 15  # of the longest side of a body, by which it bends and rolls as it should
-COARSE = 4  # cells across below which that is said
 PRECISIONS = {"float32": torch.float32, "float64": torch.float64}
 
 
@@ -30,6 +28,7 @@ class Estimate(AbstractArtifact):
     history: dict[str, list[float]] = field(default_factory=dict)  # curves of the learning
 
     def check(self) -> None:
+        check_old_names(self.parameters)
         for name, value in self.parameters.items():
             require_finite(f"parameter {name}", value)
         require_finite("velocity", self.velocity)
@@ -65,20 +64,6 @@ class World:
         self.material.check_parameters({name: torch.tensor(value) for name, value in self.start.items()})
         for boundary in self.boundaries:
             boundary.check()
-
-    def check_size(self, position: Float[Tensor, "p 3"], spacing: float, log: Log) -> None:
-        """Raise ValueError if the body at `position` [m], its particles `spacing` [m] apart, is smaller than a cell."""
-        extent = [float(e) + spacing for e in position.amax(0) - position.amin(0)]
-        size, across = " x ".join(f"{e:.3g}" for e in extent), max(extent) / self.dx
-        if across < 1:
-            raise ValueError(
-                f"world.dx is {self.dx:g} m, but the body is only {size} m: smaller than a cell; take dx <= "
-                f"{max(extent) / CELLS_ACROSS:.2g} m (scene.dx), and half of that as scene.spacing"
-            )
-        if across < COARSE:
-            log.warn(
-                f"the body, {size} m, is only {across:.1f} cells of world.dx = {self.dx:g} m across; take a smaller dx"
-            )
 
     @property
     def dtype(self) -> torch.dtype:

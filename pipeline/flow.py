@@ -14,7 +14,7 @@ from typing import Any
 
 from pipeline.page import STAGES
 from pipeline.server import server
-from pipeline.stage import Filed, Part, StageError, Step, as_task, build, damage, load, peek, usual_seconds
+from pipeline.stage import Filed, Part, StageError, Step, Unknown, as_task, build, damage, load, peek, usual_seconds
 
 
 @dataclass(frozen=True)
@@ -25,19 +25,22 @@ class Plan:
     left_out: dict[str, str] = field(default_factory=dict)
 
 
-def first(config: dict[str, Any], shelf: Path) -> Step:
-    """The step that everything else depends on: what it finds decides which stages are needed."""
-    return Step.of("capture", "capture", config["capture"], (), shelf)
+def first(config: dict[str, Any], shelf: Path, ask: bool = True) -> Step:
+    """The step that everything else depends on: what it finds decides which stages are needed.
+
+    `ask` sources what they read, see `Step.of`, here and in `plan`.
+    """
+    return Step.of("capture", "capture", config["capture"], (), shelf, ask)
 
 
-def plan(config: dict[str, Any], capture: Step) -> Plan:
+def plan(config: dict[str, Any], capture: Step, ask: bool = True) -> Plan:
     """The graph of a scene whose capture has been filed."""
     without = left_out(config, peek(capture.folder), capture.shelf)
     steps = [capture]
 
     def step(name: str, *inputs: Any, stage: str | None = None) -> Step:
         stage = stage or name
-        steps.append(Step.of(name, stage, config[stage], inputs, capture.shelf))
+        steps.append(Step.of(name, stage, config[stage], inputs, capture.shelf, ask))
         return steps[-1]
 
     guess = step("guess")
@@ -81,10 +84,13 @@ def left_out(config: dict[str, Any], capture: dict[str, Any], shelf: Path) -> di
 
 def up_to_date(config: dict[str, Any], shelf: Path, verify: bool) -> Plan | None:
     """The plan, if every step of it has been filed already, else None."""
-    capture = first(config, shelf)
-    if damage(capture, verify):
+    try:
+        capture = first(config, shelf, ask=False)
+        if damage(capture, verify):
+            return None
+        whole = plan(config, capture, ask=False)
+    except Unknown:
         return None
-    whole = plan(config, capture)
     return None if any(damage(step, verify) for step in whole.steps) else whole
 
 

@@ -8,15 +8,16 @@ import torch
 from annotated_types import Gt, Le
 
 from physics3d.checks import Device, Text, Whole, require_fields
-from physics3d.filling.fill import Body
+from physics3d.filling.body import Body
 from physics3d.gaussians.cameras import Camera
 from physics3d.gaussians.deform import Backdrop, render_deformed
 from physics3d.gaussians.interior import Interior, paint
 from physics3d.gaussians.model import Gaussians
 from physics3d.log import Log
-from physics3d.mpm.rollout import Trajectory
+from physics3d.pictures import contact_sheet, space_time_slice, to_uint8
 from physics3d.scenes.base import Capture, Outline
-from physics3d.video import Video, contact_sheet, space_time_slice, to_uint8, write_mp4
+from physics3d.trajectory import Trajectory
+from physics3d.video import Video, write_mp4
 
 LEAST_MOTION = 1.0  # [px]: what moves less is not seen to
 
@@ -107,7 +108,9 @@ class Render:
                 if seen.any():
                     furthest = max(furthest, float((now - start)[seen].norm(dim=1).max()))
         log.metric("motion_px", furthest)
-        if furthest < LEAST_MOTION:
+        if furthest >= LEAST_MOTION:
+            log.info(f"the body moves by up to {furthest:.2g} pixels")
+        else:
             log.warn(
                 f"nothing is seen to move: at most {furthest:.2g} pixels; push harder (simulate.force, "
                 "scene.excitation), soften the material, or let go of what holds it (scene.boundaries, fill.attach)"

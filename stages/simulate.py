@@ -9,9 +9,11 @@ import torch
 from physics3d.boundaries.base import AbstractBoundary
 from physics3d.boundaries.impulse import Impulse
 from physics3d.checks import Device, Frames, Keys, Rate, require_fields
-from physics3d.filling.fill import Body
+from physics3d.filling.body import Body
+from physics3d.filling.in_world import look_ahead
 from physics3d.log import Log
-from physics3d.mpm.rollout import Trajectory, rollout
+from physics3d.mpm.rollout import rollout
+from physics3d.trajectory import Trajectory
 from physics3d.world import Estimate, World
 
 Force = Annotated[Mapping[str, float], Keys(("x", "y", "z"))]  # [N]
@@ -38,9 +40,10 @@ class Simulate:
             )
 
     def __call__(self, body: Body, estimate: Estimate, *, log: Log) -> Trajectory:
-        """Raises ValueError as `check` and `rollout` do, or if the body is smaller than a cell."""
+        """Raises ValueError as `check`, `look_ahead` and `rollout` do."""
         self.check()
-        self.world.check_size(body.position, body.spacing, log)
+        excitation = excited(self.excitation, self.force)
+        look_ahead(body, self.world, excitation, log)
         with torch.no_grad():
             trajectory = rollout(
                 self.world,
@@ -48,7 +51,7 @@ class Simulate:
                 body.position,
                 body.volume,
                 velocity=estimate.velocity,
-                excitation=(*body.held(self.world.boundaries), *excited(self.excitation, self.force)),
+                excitation=(*body.held, *excitation),
                 frames=self.frames,
                 frame_dt=1 / self.fps,
                 device=self.device,
@@ -103,6 +106,10 @@ def _report(trajectory: Trajectory, log: Log) -> None:
     worst = int(max(health["inverted"]))
     if worst:
         log.warn(f"up to {worst} particles are turned inside out; take a smaller cfl, a smaller dx or a weaker force")
+    moved = float((trajectory.position - trajectory.rest_position).norm(dim=2).max())
+    size = float((trajectory.rest_position.amax(0) - trajectory.rest_position.amin(0)).max())
+    log.metric("moved", moved)
+    log.info(f"it moves by at most {1e3 * moved:.3g} mm, {100 * moved / max(size, 1e-12):.2g} % of its size")
     lonely = int(health["isolated"][0])
     if lonely:
         log.warn(f"{lonely} particles have no neighbour within a cell and move alone; fill more densely or enlarge dx")

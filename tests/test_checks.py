@@ -41,7 +41,8 @@ CASES = [  # hint, what it allows, what it does not, the remedy
     (Annotated[tuple[float, float], Ascending()], [(1, 2), (2, 2)], [(2, 1)], "none below the one before it"),
     (Direction, [(0, 0, 1)], [(0, 0, 0), (0, 0), (0, 0, math.nan)], "take a"),
     (Box, [(0, 0, 1, 1)], [(0.5, 0, 0.2, 1), (0, 0.5, 1, 0.5), (0, 0, 1, 1.1), (0, 0, 1)], "take"),
-    (Annotated[dict[str, float], Keys(("x", "y"))], [{"x": 1, "y": 2}], [{"x": 1}, {"x": 1, "z": 3}, 3], "x, y"),
+    (Annotated[dict[str, float], Keys(("x", "y"))], [{"x": 1, "y": 2}], [{"x": 1}, {"x": 1, "y": 2, "z": 3}, 3],
+     "x, y"),
     (Device, ["auto", "cpu", "cuda:1"], ["gpu", "cuda:", None, 0], "take auto, cpu, cuda or cuda:<number>"),
 ]  # fmt: skip
 

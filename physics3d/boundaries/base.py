@@ -76,6 +76,14 @@ class AbstractBoundary(abc.ABC):
         """Weight per particle for `acceleration` and `steer`; 0 leaves the particle alone."""
         return torch.zeros(len(setting.position), dtype=torch.float64)
 
+    def behind(self, setting: Setting) -> Float[Tensor, " p"]:
+        """How deep each particle starts behind a surface of this boundary [m], where nothing should be; else <= 0."""
+        return torch.zeros(len(setting.position), dtype=torch.float64)
+
+    def holds(self, setting: Setting) -> Float[Tensor, " p"]:
+        """1 for particles whose place, at rest, this boundary holds still from the start; else 0."""
+        return torch.zeros(len(setting.position), dtype=torch.float64)
+
     def walls(self, setting: Setting) -> tuple[Wall, ...]:
         """Planes the solver may mirror at; `node` must hold on and behind them all the same."""
         return ()

@@ -35,6 +35,12 @@ class BoundingBox(base.AbstractBoundary):
         slack = 1e-3 * setting.dx  # a node on the wall belongs to it whatever the rounding
         return torch.cat([lower + slack, upper - slack])
 
+    def behind(self, setting: base.Setting) -> Float[Tensor, " p"]:
+        lower, upper = (
+            setting.position.new_tensor(c) for c in (self.lower or setting.lower, self.upper or setting.upper)
+        )
+        return torch.maximum(lower - setting.position, setting.position - upper).amax(1)
+
     def walls(self, setting: base.Setting) -> tuple[base.Wall, ...]:
         if self.kind == "separate":
             return ()

@@ -35,6 +35,10 @@ class FixedRegion(base.AbstractBoundary):
     def signals(self, t: float, dt: float) -> tuple[float]:
         return (float(self.start <= t < self.start + self.duration),)
 
+    def holds(self, setting: base.Setting) -> Float[Tensor, " p"]:
+        inside = base.inside_box(setting.position, self.lower, self.upper)
+        return inside if self.start <= 0 else torch.zeros_like(inside)
+
     def node(self, real: type) -> wp.Function:
         return _node(real)
 

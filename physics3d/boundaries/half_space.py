@@ -56,6 +56,10 @@ class HalfSpace(base.AbstractBoundary):
             ]
         )
 
+    def behind(self, setting: base.Setting) -> Float[Tensor, " p"]:
+        normal = setting.position.new_tensor(self.normal)
+        return (setting.position.new_tensor(self.point) - setting.position) @ normal / normal.norm()
+
     def walls(self, setting: base.Setting) -> tuple[base.Wall, ...]:
         length = math.hypot(*self.normal)
         axis = max(range(3), key=lambda i: abs(self.normal[i]))

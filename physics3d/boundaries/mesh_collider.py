@@ -121,6 +121,13 @@ class MeshCollider(base.AbstractBoundary):
         place = np.array(self.position) + now * velocity
         return (*place, *_turn(now * axis).flat, *(share * velocity), *gradient.flat)
 
+    def behind(self, setting: base.Setting) -> Float[Tensor, " p"]:
+        vertices, triangles = self._mesh()
+        placed = self.scale * vertices @ _turn(np.array(self.rotation)).T
+        pose = np.array(self.signals(0.0, 0.0))
+        places = (setting.position.numpy() - pose[:3]) @ pose[3:12].reshape(3, 3)  # rows: R^T (x - p)
+        return -torch.from_numpy(_signed_distance(placed, triangles, placed.mean(0), places)).double()
+
     def node(self, real: type) -> wp.Function:
         return _node(real, self.kind)
 
@@ -179,18 +186,24 @@ def _distance(
     vertices: bytes, triangles: bytes, corner: base.Vector, count: tuple[int, int, int], spacing: float
 ) -> Float[Tensor, " k"]:
     """Signed distance [m], below 0 inside, at count[0] x count[1] x count[2] places from the corner on."""
-    o3d = open3d()
-    origin = np.array(corner)  # float32 rays: small numbers keep their digits
-    points = (np.frombuffer(vertices).reshape(-1, 3) - origin).astype(np.float32)
-    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(
-        o3d.core.Tensor(points), o3d.core.Tensor(np.frombuffer(triangles, np.int32).reshape(-1, 3).astype(np.uint32))
-    )
     axes = [np.arange(n, dtype=np.float32) * np.float32(spacing) for n in count]
     places = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    points, faces = np.frombuffer(vertices).reshape(-1, 3), np.frombuffer(triangles, np.int32).reshape(-1, 3)
+    return torch.from_numpy(_signed_distance(points, faces, np.array(corner), places, relative=True))
+
+
+def _signed_distance(
+    vertices: np.ndarray, triangles: np.ndarray, origin: np.ndarray, places: np.ndarray, relative: bool = False
+) -> np.ndarray:
+    """Distance [m] of places [k, 3] from a closed mesh, below 0 inside; they count from the origin if `relative`."""
+    o3d = open3d()
+    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+    # float32 rays: small numbers keep their digits
+    points = (vertices - origin).astype(np.float32)
+    scene.add_triangles(o3d.core.Tensor(points), o3d.core.Tensor(triangles.astype(np.uint32)))
+    local = np.ascontiguousarray(places if relative else places - origin, np.float32)
     # rays through edges may be counted twice: three samples outvote one
-    distance = scene.compute_signed_distance(o3d.core.Tensor(places), nthreads=1, nsamples=3).numpy()
-    return torch.from_numpy(distance)
+    return scene.compute_signed_distance(o3d.core.Tensor(local), nthreads=1, nsamples=3).numpy()
 
 
 def _cross(w: np.ndarray) -> np.ndarray:

@@ -38,6 +38,13 @@ class MovingCuboid(base.AbstractBoundary):
         """(1 while it is there, time since it came [s])"""
         return float(self.start <= t < self.start + self.duration), t - self.start
 
+    def behind(self, setting: base.Setting) -> Float[Tensor, " p"]:
+        if not self.start <= 0 < self.start + self.duration:
+            return super().behind(setting)
+        lower, upper, velocity = (setting.position.new_tensor(v) for v in (self.lower, self.upper, self.velocity))
+        x = setting.position + self.start * velocity  # where the block was as it came
+        return torch.minimum(x - lower, upper - x).amin(1)
+
     def node(self, real: type) -> wp.Function:
         return _node(real)
 

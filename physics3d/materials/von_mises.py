@@ -16,14 +16,19 @@ from jaxtyping import Float
 from torch import Tensor
 
 from physics3d.checks import NotNegative, Positive
-from physics3d.materials import base, spectral
+from physics3d.materials.base import AbstractMaterial
+from physics3d.materials.parameters import ELASTIC, Values, lame, rows
+from physics3d.materials.strain_memory import carried_strain, hencky_energy, store_strain
+from physics3d.materials.tensors import log_strain
+from physics3d.materials.tensors.replay import without_replay
+from physics3d.warp_types import matrix
 
 
 @dataclass(frozen=True, kw_only=True)
-class VonMises(base.AbstractMaterial):
+class VonMises(AbstractMaterial):
     """Parameters: youngs_modulus [Pa], poissons_ratio, yield_stress [Pa] in tension, hardening_modulus [Pa]."""
 
-    RANGES = base.ELASTIC | {"yield_stress": Positive, "hardening_modulus": NotNegative}
+    RANGES = ELASTIC | {"yield_stress": Positive, "hardening_modulus": NotNegative}
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -37,10 +42,10 @@ class VonMises(base.AbstractMaterial):
     def memory_rows(self) -> int:
         return 7
 
-    def coefficients(self, values: base.Values) -> Float[Tensor, "4 n"]:
+    def coefficients(self, values: Values) -> Float[Tensor, "4 n"]:
         self.check_parameters(values)
-        mu, lam = base.lame(values["youngs_modulus"], values["poissons_ratio"])
-        return base.rows(mu, lam + 2 / 3 * mu, values["yield_stress"], values["hardening_modulus"])
+        mu, lam = lame(values["youngs_modulus"], values["poissons_ratio"])
+        return rows(mu, lam + 2 / 3 * mu, values["yield_stress"], values["hardening_modulus"])
 
     def wave_modulus(self, coefficients: Float[Tensor, "4 n"]) -> Float[Tensor, " n"]:
         return coefficients[1] + 4 / 3 * coefficients[0]
@@ -50,7 +55,7 @@ class VonMises(base.AbstractMaterial):
     ) -> Float[Tensor, " n"]:
         """With the energy stored in hardening."""
         mu, K, _, h = coefficients
-        return base.hencky_energy(mu, K, memory[:6]) + h / 2 * memory[6] ** 2
+        return hencky_energy(mu, K, memory[:6]) + h / 2 * memory[6] ** 2
 
     def advance(self, real: type) -> wp.Function:
         return _advance(real)
@@ -58,8 +63,8 @@ class VonMises(base.AbstractMaterial):
 
 @functools.cache
 def _advance(real: type) -> wp.Function:
-    mat33 = spectral.matrix_type(real)
-    relax, carried, store = spectral.relax_hencky(real), base.carried_strain(real), base.store_strain(real)
+    mat33 = matrix(real)
+    relax, carried, store = log_strain.relax(real), carried_strain(real), store_strain(real)
     root = real((2 / 3) ** 0.5)
 
     @wp.func(name=f"von_mises_return_{real.__name__}")
@@ -98,4 +103,4 @@ def _advance(real: type) -> wp.Function:
         tau = real(2.0) * mu * wp.exp(-shrink) * (eps - mean * one) + real(3.0) * coefficients[1, p] * mean * one
         return H + M + M * H, tau
 
-    return spectral.without_replay(advance)
+    return without_replay(advance)

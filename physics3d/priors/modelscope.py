@@ -21,7 +21,7 @@ from torch.utils.checkpoint import checkpoint
 
 from physics3d.checks import Ascending, Device, Pixels, Share, Text, require_fields
 from physics3d.priors.base import AbstractPrior, Level, x0_from
-from physics3d.priors.weights import Precision, load_pipeline
+from physics3d.priors.weights import Precision, load_pipeline, pipeline_files
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,6 +39,12 @@ class ModelScope(AbstractPrior):
 
     def __post_init__(self):
         require_fields(self, "prior")
+
+    def files(self) -> tuple[str, ...]:
+        """Of the weights, fetched if they are not on this machine: part of the fingerprint of what is learned."""
+        from diffusers.pipelines.deprecated.text_to_video_synthesis import TextToVideoSDPipeline
+
+        return pipeline_files(TextToVideoSDPipeline, self.model, key="prior.model", variant=self.variant)
 
     @cached_property
     def pipeline(self) -> Any:

@@ -24,7 +24,7 @@ from torch.utils.checkpoint import checkpoint
 
 from physics3d.checks import Ascending, Device, NotNegative, Pixels, Positive, Rate, Text, require_fields
 from physics3d.priors.base import AbstractPrior, Level, x0_from
-from physics3d.priors.weights import Precision, load_pipeline
+from physics3d.priors.weights import Precision, load_pipeline, pipeline_files
 
 
 class ImageCondition(NamedTuple):
@@ -50,6 +50,12 @@ class StableVideo(AbstractPrior):
 
     def __post_init__(self):
         require_fields(self, "prior")
+
+    def files(self) -> tuple[str, ...]:
+        """Of the weights, fetched if they are not on this machine: part of the fingerprint of what is learned."""
+        from diffusers import StableVideoDiffusionPipeline
+
+        return pipeline_files(StableVideoDiffusionPipeline, self.model, key="prior.model", variant=self.variant)
 
     @cached_property
     def pipeline(self) -> Any:

@@ -53,8 +53,8 @@ class BallTwin(AbstractSource):
     poissons_ratio: PoissonsRatio = 0.3
     branch_shear_modulus: Positive = 1.2e3  # mu_N [Pa]
     branch_bulk_modulus: Positive = 2.0e3  # K_N [Pa]
-    shear_viscosity_time: Duration = 0.05  # 1/k_d [s]
-    bulk_viscosity_time: Duration = 0.05  # 1/k_v [s]
+    shear_relaxation_time: Duration = 0.05  # 1/k_d [s]
+    bulk_relaxation_time: Duration = 0.05  # 1/k_v [s]
     density: Positive = 300.0  # [kg/m^3]
     gravity: float = 9.81  # downward [m/s^2]
     # how the reference motion is computed: finer than the pipeline

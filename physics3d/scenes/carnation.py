@@ -57,8 +57,8 @@ class CarnationTwin(AbstractSource):
     poissons_ratio: PoissonsRatio = 0.3
     branch_shear_modulus: Positive = 3.0e4  # mu_N [Pa]
     branch_bulk_modulus: Positive = 6.5e4  # K_N, of the same Poisson ratio [Pa]
-    shear_viscosity_time: Duration = 0.15  # 1/k_d [s]
-    bulk_viscosity_time: Duration = 0.15  # 1/k_v [s]
+    shear_relaxation_time: Duration = 0.15  # 1/k_d [s]
+    bulk_relaxation_time: Duration = 0.15  # 1/k_v [s]
     density: Positive = 300.0  # petals hold much air [kg/m^3]
     # how the reference motion is computed: finer than the pipeline
     dx: Length = 0.010  # cell of the grid [m]

@@ -12,6 +12,8 @@ COLMAP fixes neither the unit of length, nor where up is, nor the origin; `uprig
 Schönberger and Frahm (2016); pycolmap is an optional extra.
 """
 
+import signal
+import threading
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -154,6 +156,7 @@ def floor_plane(
 
 
 def _pycolmap():
+    handler = signal.getsignal(signal.SIGTERM)
     try:
         import pycolmap
     except ImportError as error:
@@ -161,6 +164,8 @@ def _pycolmap():
             "photographs without cameras need pycolmap, which is not installed; .venv/bin/python -m pip install "
             "pycolmap (it is the extra 'sfm'), or solve the cameras elsewhere and take ColmapSource"
         ) from error
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, handler)  # COLMAP's would end the process with a stack of C++
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
     return pycolmap
 

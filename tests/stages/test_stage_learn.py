@@ -153,3 +153,16 @@ def test_impossible_options_are_refused(change):
 def test_a_capture_without_a_take_is_refused(clip):
     with pytest.raises(ValueError, match="no take with role learn"):
         learner(START, ("youngs_modulus",))(replace(clip, takes=()), *bar(), log=Log(None))
+
+
+def test_what_cannot_be_learned_from_is_found_before_learning_begins(clip, tmp_path):
+    """... and not after minutes: the push of the take misses the body; a cell is larger than the body."""
+    log = Log(tmp_path, quiet=True)
+    gaussians, body = bar()
+    away = replace(body, position=body.position + torch.tensor([5.0, 0.0, 0.0]))
+    stage = learner(START, ("youngs_modulus",))
+    with pytest.raises(ValueError, match=r"Impulse.* holds none of .* the body lies in \(4\.9"):
+        stage(clip, gaussians, away, log=log)
+    with pytest.raises(ValueError, match=r"world.dx is 2 m.* smaller than a cell"):
+        replace(stage, world=replace(stage.world, dx=2.0))(clip, gaussians, body, log=log)
+    assert not (tmp_path / "log.txt").exists()

@@ -5,8 +5,8 @@ import torch
 from small_scene import bar, cameras
 
 from physics3d.log import Log
-from physics3d.mpm.rollout import Trajectory
 from physics3d.scenes.base import Capture, Outline
+from physics3d.trajectory import Trajectory
 from stages.render import Render
 
 
