@@ -65,7 +65,7 @@ class Tracking:
         from mlflow.entities import Param
         from mlflow.tracking import MlflowClient
 
-        logging.getLogger("mlflow").setLevel(logging.ERROR)
+        logging.getLogger("mlflow").setLevel(logging.CRITICAL)  # it would print whole tracebacks; we say one line
         with _lock(self.output):
             if not (self.output / "mlflow.db").exists():
                 _make(self.output)
