@@ -63,19 +63,28 @@ def write_mp4(path: Path, frames: UInt8[Tensor, "t h w 3"], fps: float) -> None:
 
 
 def read_mp4(path: Path) -> tuple[UInt8[Tensor, "t h w 3"], float]:
-    """Decode a video -> (frames, fps). Raises ValueError naming the file if it cannot be read."""
+    """Decode a video, turned as it says -> (frames, fps). Raises ValueError naming the file if it cannot be read.
+
+    Frames are evenly spaced in time: those of a variable rate (telephones, browsers) are taken at their mean rate.
+    """
     import imageio.v2 as imageio
+    import imageio_ffmpeg
 
     ffmpeg()
     if not path.is_file():
         raise ValueError(f"no video at {path}; check the path in the scene's configuration")
     try:
+        count, seconds = imageio_ffmpeg.count_frames_and_secs(path)
         with imageio.get_reader(path) as reader:
             fps = float(reader.get_meta_data()["fps"])  # type: ignore[attr-defined]
+        even = abs(fps * seconds - count) <= max(2, 0.05 * count)
+        mean = fps if even else round(count / seconds, 3)
+        with imageio.get_reader(path, **({} if even else {"fps": mean})) as reader:
             frames = np.stack([np.asarray(frame) for frame in reader])  # type: ignore[attr-defined]
     except Exception as error:
-        raise ValueError(f"cannot read the video {path}: {error}") from error
-    return torch.from_numpy(frames), fps
+        reason = " ".join(str(error).split())[-300:]
+        raise ValueError(f"cannot read the video {path}: {reason}") from error
+    return torch.from_numpy(frames), mean
 
 
 def contact_sheet(frames: UInt8[Tensor, "t h w 3"], *, columns: int = 6, count: int = 12) -> UInt8[Tensor, "H W 3"]:

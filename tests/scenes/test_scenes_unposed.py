@@ -10,9 +10,10 @@ import torch
 
 from physics3d.gaussians.cameras import look_at
 from physics3d.log import Log
-from physics3d.scenes.sfm import floor_plane, level, nearest_to_axes
+from physics3d.scenes.frames import sharpest_frames
+from physics3d.scenes.ground import floor_plane, level, nearest_to_axes
 from physics3d.scenes.transforms import TransformsSource
-from physics3d.scenes.unposed import UnposedSource, _frames
+from physics3d.scenes.unposed import UnposedSource
 
 UP = np.array([0.3, -0.8, 0.2]) / np.linalg.norm([0.3, -0.8, 0.2])
 
@@ -68,7 +69,7 @@ def test_the_sharpest_frame_of_each_stretch_of_a_video_is_taken(tmp_path, rng):
         writer.write(frame if i % 5 == 2 else cv2.GaussianBlur(frame, (9, 9), 3))
     writer.release()
     (tmp_path / "out").mkdir()
-    _frames(tmp_path / "a.avi", tmp_path / "out", 4, 48, Log(None))
+    sharpest_frames(tmp_path / "a.avi", tmp_path / "out", 4, 48, Log(None))
     files = sorted((tmp_path / "out").iterdir())
     assert len(files) == 4
     for k, file in enumerate(files):
