@@ -76,7 +76,7 @@ def read_ply(path: Path, *, log=None) -> Gaussians:
         columns(("opacity",))
     arrays = {
         "mean": mean,
-        "log_scale": _log_scale(columns(scale, -np.inf), mean, path, said),
+        "log_scale": _log_scale(columns(scale, -np.inf), mean, _is_share(opacity), path, said),
         "quaternion": columns(ROTATION),
         "opacity_logit": _logit(opacity, said),
         "sh": np.concatenate([dc, higher], 1),
@@ -98,12 +98,19 @@ def _near(mean: np.ndarray, stored_bytes: int, said: list[str]) -> np.ndarray:
     said.append(f"far from the origin: shifted by {(-offset).tolist()}, in the units and axes of the file")
     if stored_bytes < 8:
         step = float(np.spacing(np.float32(np.abs(mean).max())))
-        said.append(f"positions were rounded to steps of {step:g} before they were stored; export doubles, or shift first")
+        said.append(
+            f"positions were rounded to steps of {step:g} before they were stored; export doubles, or shift first"
+        )
     return mean - offset
 
 
+def _is_share(opacity: np.ndarray) -> bool:
+    """Whether these are opacities: as logits they would all mean 0.5 to 0.73."""
+    return bool(opacity.min() >= 0 and 0 < opacity.max() <= 1)
+
+
 def _logit(opacity: np.ndarray, said: list[str]) -> np.ndarray:
-    if 0 <= opacity.min() and 0 < opacity.max() <= 1:
+    if _is_share(opacity):
         said.append("opacity lies within 0..1 everywhere: taken as it is, not as a logit")
         with np.errstate(divide="ignore"):
             opacity = np.log(opacity) - np.log1p(-opacity)
@@ -112,15 +119,17 @@ def _logit(opacity: np.ndarray, said: list[str]) -> np.ndarray:
     return np.where(np.isinf(opacity), np.sign(opacity) * OPAQUE, opacity)
 
 
-def _log_scale(scale: np.ndarray, mean: np.ndarray, path: Path, said: list[str]) -> np.ndarray:
+def _log_scale(scale: np.ndarray, mean: np.ndarray, as_is: bool, path: Path, said: list[str]) -> np.ndarray:
     """[n, 3], finite. Raises ValueError if a Gaussian has no size at all."""
     from scipy.spatial import cKDTree
 
     if scale.min() >= 0 and scale.max() > 0 and len(mean) > 1:
-        # ln of sizes above one unit, or sizes? whichever is nearer to the distance of neighbours
+        # ln of sizes above one unit, or sizes? whichever is nearer to the distance of neighbours, by a factor of three in
+        # favour of sizes where opacity was stored as it is
         spacing = np.median(cKDTree(mean).query(mean, k=2)[0][:, 1])
         widest = np.median(scale.max(1))
-        if spacing > 0 and widest > 0 and abs(np.log(widest / spacing)) < abs(widest - np.log(spacing)):
+        favour = np.log(3.0) if as_is else 0.0
+        if spacing > 0 and widest > 0 and abs(np.log(widest / spacing)) < abs(widest - np.log(spacing)) + favour:
             said.append("scale is positive everywhere and fits the distances as it is: not taken as a logarithm")
             with np.errstate(divide="ignore"):
                 scale = np.log(scale)

@@ -39,7 +39,9 @@ class ColmapSource(AbstractPosedSource):
         posed = []
         for path, image in found:
             if image.camera not in model.cameras:
-                raise ValueError(f"{path}: its camera {image.camera} is not in {model.files[0]}; the model is incomplete")
+                raise ValueError(
+                    f"{path}: its camera {image.camera} is not in {model.files[0]}; the model is incomplete"
+                )
             camera = model.cameras[image.camera]
             lens = _lens(camera, path)
             posed.append(

@@ -1,9 +1,9 @@
 """Which way is up, where the floor is and what the cameras look at, told by cameras and points alone.
 
-    up      = the unit u of least  mean_i (u.x_i)^2 + 0.005 |u - (u.y) y|^2,  x_i the cameras' right, y their mean up:
-              people hold the horizon level; if a plane of points lies within 15 degrees of that, the plane's normal
-    middle  = the point nearest to all optical axes; the points' median where the axes do not meet before the cameras
-    span    = the largest angle between two cameras, as seen from the middle
+up      = the unit u of least  mean_i (u.x_i)^2 + 0.005 |u - (u.y) y|^2,  x_i the cameras' right, y their mean up:
+          people hold the horizon level; if a plane of points lies within 15 degrees of that, the plane's normal
+middle  = the point nearest to all optical axes; the points' median where the axes do not meet before the cameras
+span    = the largest angle between two cameras, as seen from the middle
 """
 
 from dataclasses import dataclass

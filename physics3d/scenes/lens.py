@@ -63,7 +63,9 @@ class Lens:
     def pixels(self, xy: Float64[np.ndarray, "*n 2"]) -> Float64[np.ndarray, "*n 2"]:
         """Where the picture shows what is at (x, y) [px]."""
         bent = self.distort(xy)
-        return np.stack([self.fx * bent[..., 0] + self.skew * bent[..., 1] + self.cx, self.fy * bent[..., 1] + self.cy], -1)
+        return np.stack(
+            [self.fx * bent[..., 0] + self.skew * bent[..., 1] + self.cx, self.fy * bent[..., 1] + self.cy], -1
+        )
 
     def directions(self, uv: Float64[np.ndarray, "*n 2"], name: str) -> Float64[np.ndarray, "*n 2"]:
         """The inverse of `pixels`, by Newton's method. Raises ValueError naming the picture where there is none."""
@@ -91,8 +93,7 @@ class Lens:
         zero, one = np.zeros(RIM), np.ones(RIM)
         size = (self.width, self.height)
         left, right, top, bottom = (
-            self.directions(np.stack(side, -1) * size, name)
-            for side in ((zero, t), (one, t), (t, zero), (t, one))
+            self.directions(np.stack(side, -1) * size, name) for side in ((zero, t), (one, t), (t, zero), (t, one))
         )
         low = np.array([left[:, 0].max(), top[:, 1].max()])
         high = np.array([right[:, 0].min(), bottom[:, 1].min()])

@@ -45,7 +45,9 @@ class LlffSource(AbstractPosedSource):
                 Posed(
                     path=path,
                     name=path.name,
-                    lens=lambda w, h, focal=float(focal): Lens(width=w, height=h, fx=focal, fy=focal, cx=w / 2, cy=h / 2),
+                    lens=lambda w, h, focal=float(focal): Lens(
+                        width=w, height=h, fx=focal, fy=focal, cx=w / 2, cy=h / 2
+                    ),
                     size=(round(width), round(height)),
                     world_to_camera=rigid_inverse(pose, str(path)),
                 )

@@ -89,13 +89,17 @@ class PacNerfSource(AbstractSource):
                         f"{path} is {tuple(read.image.shape)}, frame 0 of its camera {tuple(clip[0].shape)}; resize one"
                     )
                 elif not _same(camera, cameras[-1]):
-                    raise ValueError(f"{path}: its camera differs from that of frame 0; a camera of a take stands still")
+                    raise ValueError(
+                        f"{path}: its camera differs from that of frame 0; a camera of a take stands still"
+                    )
             videos.append(torch.stack(clip))
         takes: tuple[Take, ...] = ()
         if len(instants) > 1:
             duration = times[instants[-1]] - times[0]
             if not 0 < duration < math.inf:
-                raise ValueError(f"{file}: time runs from {times[0]} to {times[instants[-1]]} s; it must increase by frame")
+                raise ValueError(
+                    f"{file}: time runs from {times[0]} to {times[instants[-1]]} s; it must increase by frame"
+                )
             fps = (len(instants) - 1) / duration
             take = Take(
                 name="drop",

@@ -19,7 +19,7 @@ from torch import Tensor
 from physics3d.scenes.lens import Lens, undistorted
 from physics3d.scenes.pictures import Picture, read_picture
 
-SAME_SCALE = 0.02  # a picture within this of the size that its camera file gives was cropped, not reduced
+SAME_SCALE = 0.02  # a picture with a side within this of what its camera file gives was cropped, not reduced
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,7 +103,7 @@ def _equal_or_reduced(have: tuple[int, int], size: tuple[int, int]) -> bool:
 def _reduced(have: tuple[int, int], size: tuple[int, int]) -> bool:
     """Whether a picture has the shape of `size` but for a rounding of a pixel, and another scale."""
     same_shape = abs(have[0] * size[1] - have[1] * size[0]) <= max(size)
-    return same_shape and abs(have[0] / size[0] - 1) > SAME_SCALE
+    return same_shape and all(abs(h / s - 1) > SAME_SCALE for h, s in zip(have, size))
 
 
 def _mask(path: Path, picture: Picture, of: Path) -> Float32[np.ndarray, "h w"]:
@@ -142,7 +142,9 @@ def mattes(names: list[str], alphas: list[Tensor | None]) -> tuple[Tensor, ...]:
         return ()
     if present and len(present) < len(alphas):
         odd = names[next(i for i, a in enumerate(alphas) if a is None)]
-        raise ValueError(f"{odd} has no alpha channel or mask but other images have one; give all images a matte or none")
+        raise ValueError(
+            f"{odd} has no alpha channel or mask but other images have one; give all images a matte or none"
+        )
     return tuple(present)
 
 

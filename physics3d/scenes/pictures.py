@@ -22,7 +22,19 @@ PHOTOGRAPHS = (
     ".jpg", ".jpeg", ".jpe", ".jfif", ".mpo", ".png", ".webp", ".avif", ".tif", ".tiff", ".bmp", ".jp2", ".gif",
     ".ppm", ".pgm", ".pnm",
 )  # fmt: skip
-UNREAD = (".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".exr")  # formats to convert
+UNREAD = (
+    ".heic",
+    ".heif",
+    ".dng",
+    ".cr2",
+    ".cr3",
+    ".nef",
+    ".arw",
+    ".raf",
+    ".orf",
+    ".rw2",
+    ".exr",
+)  # formats to convert
 TURN = 0x0112  # the EXIF tag of the orientation
 QUARTER = (5, 6, 7, 8)  # orientations that exchange width and height
 

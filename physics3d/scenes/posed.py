@@ -44,7 +44,9 @@ class Points:
 class AbstractPosedSource(AbstractSource):
     name: str
     path: str
-    up: tuple[float, float, float] | None = None  # in the source's axes; None: how the cameras were held, or the floor's
+    up: tuple[float, float, float] | None = (
+        None  # in the source's axes; None: how the cameras were held, or the floor's
+    )
     scale: float | None = None  # metres per unit [m]; None: so that the cameras are 1 m from what they look at
     held_out_every: int = 8  # every so many images are kept for evaluation; 0: none
     resolution: float | None = None  # factor on both image sides, in (0, 1]

@@ -140,7 +140,8 @@ def _extract(pycolmap, database: Path, images: Path, names: list[str], log) -> N
             kept = np.sort(np.argsort(-area, kind="stable")[:FEATURES])
             for table, array in (("keypoints", keypoints), ("descriptors", descriptors)):
                 db.execute(
-                    f"UPDATE {table} SET rows = ?, data = ? WHERE image_id = ?", (len(kept), array[kept].tobytes(), image)
+                    f"UPDATE {table} SET rows = ?, data = ? WHERE image_id = ?",
+                    (len(kept), array[kept].tobytes(), image),
                 )
 
 
@@ -164,7 +165,9 @@ def _matches(pycolmap, database: Path):
         cameras = {c.camera_id: np.array([c.width, c.height]) / 2 for c in opened.read_all_cameras()}
         middle = {i.image_id: cameras[i.camera_id] for i in opened.read_all_images()}
         with contextlib.closing(sqlite3.connect(database)) as db:
-            found = [i for (i,) in db.execute("SELECT pair_id FROM two_view_geometries WHERE rows > 0 ORDER BY pair_id")]
+            found = [
+                i for (i,) in db.execute("SELECT pair_id FROM two_view_geometries WHERE rows > 0 ORDER BY pair_id")
+            ]
         for k in np.unique(np.linspace(0, len(found) - 1, min(len(found), PAIRS_ASKED)).round().astype(int)):
             a, b = pycolmap.pair_id_to_image_pair(found[k])
             index = np.asarray(opened.read_two_view_geometry(a, b).inlier_matches)

@@ -26,7 +26,16 @@ from physics3d.scenes.lens import Lens
 from physics3d.scenes.named import find, present, read_text, require_unique
 from physics3d.scenes.posed import AbstractPosedSource, Points, Posed
 
-MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+MODELS = (
+    "PINHOLE",
+    "SIMPLE_PINHOLE",
+    "OPENCV_PINHOLE",
+    "PERSPECTIVE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "OPENCV",
+    "FULL_OPENCV",
+)
 OTHER_CAMERAS = ("is_fisheye", "latlong", "equirectangular", "orthographic", "ftheta_p0")  # instant-ngp's switches
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
@@ -100,7 +109,9 @@ def _refuse_other_cameras(entry: dict, path: Path) -> None:
     switches = [name for name in OTHER_CAMERAS if entry.get(name)]
     if str(model).upper() not in MODELS or switches:
         said = f"camera_model {model}" if str(model).upper() not in MODELS else f"{switches[0]}: {entry[switches[0]]}"
-        raise ValueError(f"{path}: {said} is no perspective camera; known are {', '.join(MODELS)}: convert the pictures")
+        raise ValueError(
+            f"{path}: {said} is no perspective camera; known are {', '.join(MODELS)}: convert the pictures"
+        )
 
 
 def _size(entry: dict, path: Path) -> tuple[int, int] | None:

@@ -127,7 +127,7 @@ def photographs_below(folder: Path, log=None) -> list[Path]:
     others = Counter(p.suffix.lower() or "no ending" for p in files if p not in taken)
     unread = {ending: count for ending, count in others.items() if ending in UNREAD}
     if not found:
-        there = ", ".join(f"{count} {ending}" for ending, count in others.items()) or "nothing"
+        there = ", ".join(f"{count} {ending}" for ending, count in sorted(others.items())) or "nothing"
         remedy = "convert HEIC and raw photographs to JPEG first" if unread else "give a folder of JPEG or PNG files"
         if any(ending in VIDEOS for ending in others):
             remedy = "of a video, give the file itself"
