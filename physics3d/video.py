@@ -93,7 +93,11 @@ def write_mp4(path: Path, frames: UInt8[Tensor, "t h w 3"], fps: float) -> None:
 
 
 def read_mp4(path: Path) -> tuple[UInt8[Tensor, "t h w 3"], float]:
-    """Decode a video -> (frames, fps). Raises ValueError naming the file if it cannot be read to its end."""
+    """Decode a video, turned as it says -> (frames, fps). Raises ValueError naming the file if it cannot be read to its
+    end.
+
+    Frames are evenly spaced in time: those of a variable rate (telephones, browsers) are taken at their mean rate.
+    """
     if not path.is_file():
         raise ValueError(f"no video at {path}; check the path in the scene's configuration")
     import imageio_ffmpeg
@@ -105,12 +109,14 @@ def read_mp4(path: Path) -> tuple[UInt8[Tensor, "t h w 3"], float]:
         told = next(opened)
         opened.close()
         w, h = told["size"]
-        decoded = run_ffmpeg(
-            ["-xerror", "-i", target, "-f", "rawvideo", "-pix_fmt", "rgb24", "-fps_mode", "passthrough", "-"]
-        )
+        count, seconds = imageio_ffmpeg.count_frames_and_secs(target)
+        even = abs(told["fps"] * seconds - count) <= max(2, 0.05 * count)
+        fps = float(told["fps"]) if even else round(count / seconds, 3)
+        rate = ["-fps_mode", "passthrough"] if even else ["-vf", f"fps={fps}"]
+        decoded = run_ffmpeg(["-xerror", "-i", target, "-f", "rawvideo", "-pix_fmt", "rgb24", *rate, "-"])
         array = np.frombuffer(bytearray(decoded), np.uint8).reshape(-1, h, w, 3)
         if not len(array):
             raise ValueError("it holds no frames")
     except (OSError, RuntimeError, ValueError, StopIteration) as error:
         raise ValueError(f"cannot read the video {path}: {' '.join(str(error).split())[:200]}") from error
-    return torch.from_numpy(array), float(told["fps"])
+    return torch.from_numpy(array), fps

@@ -136,6 +136,7 @@ class BallTwin(AbstractSource):
             point_colors=colors,
             takes=tuple(takes),
             single_object=True,
+            floor=0.0,
             truth=self.world().start,
             truth_source="set in the code that made this twin",
             note="this is a synthetic twin: ball, photographs and motion are made by code, so its material is known",

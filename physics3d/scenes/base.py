@@ -1,5 +1,6 @@
 """A capture: all that is known about a scene before anything is computed. Metres, z up, whatever the source used."""
 
+import math
 from dataclasses import dataclass, field
 
 import torch
@@ -66,6 +67,7 @@ class Capture(AbstractArtifact):
     single_object: bool = False  # one object on a plain background: segmentation is then left out
     truth: dict[str, float] = field(default_factory=dict)  # material parameters, SI, named as in the material
     truth_source: str = ""  # where `truth` comes from, and how far to trust it
+    floor: float | None = None  # height of the ground that things stand on [m]; None: none is known
     note: str = ""  # said at the start of every run, e.g. that this is a synthetic twin
 
     def check(self) -> None:
@@ -89,6 +91,8 @@ class Capture(AbstractArtifact):
             raise ValueError(f"capture {self.name}: all {n} images are held out; leave some to train on")
         if self.points is not None:
             require_finite(f"capture {self.name}: points", self.points)
+        if self.floor is not None and not math.isfinite(self.floor):
+            raise ValueError(f"capture {self.name}: floor is {self.floor}; give its height in metres, or None")
         for take in self.takes:
             if take.role not in ("learn", "evaluate") or len(take.cameras) != len(take.videos):
                 raise ValueError(

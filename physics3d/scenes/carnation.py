@@ -125,6 +125,7 @@ class CarnationTwin(AbstractSource):
             points=points,
             point_colors=colors,
             takes=tuple(takes),
+            floor=0.0,
             truth=self.world().start,
             truth_source="set in the code that made this twin",
             note=(

@@ -46,7 +46,7 @@ class PlyScene(AbstractSource):
 
     def __call__(self, *, log) -> Capture:
         require_fields(self, "source")
-        gaussians = oriented(read_ply(Path(self.path)), Axes(up=triple("up", self.up), scale=self.scale))
+        gaussians = oriented(read_ply(Path(self.path), log=log), Axes(up=triple("up", self.up), scale=self.scale))
         solid = gaussians.mean[gaussians.opacity >= gaussians.opacity.median()].double()
         centre = solid.median(0).values
         radius = float((solid - centre).norm(dim=1).quantile(0.9))
