@@ -10,6 +10,7 @@ ROOT = Path(__file__).resolve().parent.parent
 SOURCES = sorted(p for folder in ("physics3d", "stages", "pipeline") for p in (ROOT / folder).rglob("*.py"))
 BOTTOM = (
     "physics3d.artifact",
+    "physics3d.checks",
     "physics3d.video",
     "physics3d.pictures",
     "physics3d.log",

@@ -18,20 +18,30 @@ Liu et al. (arXiv 2406.04338); where and why we depart from it: docs/method.md.
 
 import functools
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 import warp as wp
+from annotated_types import Ge, Le
 from jaxtyping import Float
 from torch import Tensor
 
+from physics3d.checks import MayBeInfinite, Positive, at_least_one, require_fields
 from physics3d.materials.base import AbstractMaterial
 from physics3d.materials.neo_hookean_branch import maxwell_neo_hookean
-from physics3d.materials.parameters import Values, check_elastic, check_names, check_range, lame, rows
+from physics3d.materials.parameters import ELASTIC, Values, lame, rows
 from physics3d.materials.strain_memory import carried_strain, hencky_energy, principal_log_strain, store_strain
 from physics3d.materials.tensors import log_strain, polar, volume
 from physics3d.materials.tensors.replay import without_replay
 from physics3d.warp_types import matrix
+
+RelaxationTime = Annotated[float, Ge(1e-30), MayBeInfinite()]  # [s]
+BRANCH = {
+    "branch_shear_modulus": Positive,
+    "branch_bulk_modulus": Positive,
+    "shear_relaxation_time": RelaxationTime,
+    "bulk_relaxation_time": RelaxationTime,
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,30 +53,26 @@ class Viscoelastic(AbstractMaterial):
     Raises ValueError for a number of branches outside 0..3, an unknown spring, or nothing at all.
     """
 
-    branches: int = 1
+    branches: Annotated[int, Ge(0), Le(3)] = 1
     elastic: bool = True  # the branch that never relaxes
     spring: Literal["hencky", "neo_hookean"] = "hencky"
 
+    RULES = (at_least_one("elastic", "branches"),)  # else no stress is defined
+    RANGES = ELASTIC | BRANCH
+
     def __post_init__(self) -> None:
-        if self.branches not in (0, 1, 2, 3):
-            raise ValueError(f"branches is {self.branches}; take 0, 1, 2 or 3")
-        if self.spring not in _MAXWELL:
-            raise ValueError(f"spring is {self.spring!r}; take one of {sorted(_MAXWELL)}")
-        if not self.elastic and not self.branches:
-            raise ValueError(
-                "elastic is False and branches is 0: no stress is defined; take branches >= 1 or elastic=True"
-            )
+        require_fields(self, type(self).__name__)
 
     @property
     def parameters(self) -> tuple[str, ...]:
         names = ("youngs_modulus", "poissons_ratio") if self.elastic else ()
-        return names + tuple(name + suffix for suffix in self._suffixes for name in _BRANCH)
+        return names + tuple(name + suffix for suffix in self._suffixes for name in BRANCH)
 
     @property
     def example(self) -> dict[str, float]:
         found = {"youngs_modulus": 1e5, "poissons_ratio": 0.3} if self.elastic else {}  # soft tissue
         for i, suffix in enumerate(self._suffixes):
-            found |= dict(zip((name + suffix for name in _BRANCH), (4e4, 8e4, 0.2 / 4**i, 0.5 / 4**i), strict=True))
+            found |= dict(zip((name + suffix for name in BRANCH), (4e4, 8e4, 0.2 / 4**i, 0.5 / 4**i), strict=True))
         return found
 
     @property
@@ -77,21 +83,11 @@ class Viscoelastic(AbstractMaterial):
     def memory_rows(self) -> int:
         return 6 * self.branches
 
-    def check_parameters(self, values: Values) -> None:
-        check_names(values, self.parameters)
-        if self.elastic:
-            check_elastic(values)
-        for suffix in self._suffixes:
-            for name in ("branch_shear_modulus", "branch_bulk_modulus"):
-                check_range(values, name + suffix, 0.0)
-            for name in ("shear_relaxation_time", "bulk_relaxation_time"):
-                check_range(values, name + suffix, 1e-30, closed=True)
-
     def coefficients(self, values: Values) -> Float[Tensor, "k n"]:
         self.check_parameters(values)
         found = list(lame(values["youngs_modulus"], values["poissons_ratio"])) if self.elastic else []
         for suffix in self._suffixes:
-            mu, K, shear_time, bulk_time = (values[name + suffix] for name in _BRANCH)
+            mu, K, shear_time, bulk_time = (values[name + suffix] for name in BRANCH)
             found += [mu, K, 1 / shear_time, 1 / bulk_time]
         return rows(*found)
 
@@ -129,9 +125,6 @@ class Viscoelastic(AbstractMaterial):
 
     def advance(self, real: type) -> wp.Function:
         return _advance(self.branches, self.elastic, self.spring, real)
-
-
-_BRANCH = ("branch_shear_modulus", "branch_bulk_modulus", "shear_relaxation_time", "bulk_relaxation_time")
 
 
 @functools.cache
