@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -79,10 +80,11 @@ def read_mp4(path: Path) -> tuple[UInt8[Tensor, "t h w 3"], float]:
             fps = float(reader.get_meta_data()["fps"])  # type: ignore[attr-defined]
         even = abs(fps * seconds - count) <= max(2, 0.05 * count)
         mean = fps if even else round(count / seconds, 3)
-        with imageio.get_reader(path, **({} if even else {"fps": mean})) as reader:
+        asked: dict[str, Any] = {} if even else {"fps": mean}
+        with imageio.get_reader(path, **asked) as reader:
             frames = np.stack([np.asarray(frame) for frame in reader])  # type: ignore[attr-defined]
     except Exception as error:
-        reason = " ".join(str(error).split())[-300:]
+        reason = (str(error).split("\n") or [""])[-1].strip() or repr(error)
         raise ValueError(f"cannot read the video {path}: {reason}") from error
     return torch.from_numpy(frames), mean
 
