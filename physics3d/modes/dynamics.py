@@ -166,8 +166,9 @@ class System:
             self._factor(which)
         fresh = False
         r = residual(x)
-        step, error = self._newton(r)
+        step, error = self._newton(r, [])
         self.scale = max(self.scale, error)
+        steps: list[np.ndarray] = []  # taken with the present matrix
         for _ in range(MOST_ITERATIONS):
             self.iterations += 1
             if error <= TOLERANCE * self.scale:
@@ -176,13 +177,13 @@ class System:
             while True:
                 y = x - share * step
                 r_new = residual(y)
-                new, new_error = self._newton(r_new)
+                new, new_error = self._newton(r_new, [*steps, -step] if share == 1 else [])
                 if new_error < (1 - share / 4) * error:
                     break
-                if not fresh:
+                if steps or not fresh:
                     self._refresh(x, after, which)
-                    fresh, share = True, 1.0
-                    step, error = self._newton(r)
+                    fresh, share, steps = True, 1.0, []
+                    step, error = self._newton(r, [])
                 elif share > SHORTEST:
                     share /= 2
                 elif error <= ROUND_OFF * self.scale:
@@ -191,18 +192,26 @@ class System:
                 else:
                     raise NotSolved("Newton's method finds no step that lessens the error")
             slow = new_error > SLOW * error
-            x, r, step, error, fresh = y, r_new, new, new_error, slow
+            steps = [*steps, -step] if share == 1 else []
+            x, r, step, error, fresh = y, r_new, new, new_error, False
             if slow:
                 self._refresh(x, after, which)
-                step, error = self._newton(r)
+                fresh, steps = True, []
+                step, error = self._newton(r, [])
         raise NotSolved(f"Newton's method does not converge in {MOST_ITERATIONS} iterations")
 
-    def _newton(self, r: np.ndarray) -> tuple[np.ndarray, float]:
-        """(A^-1 r, its size in the norm of A); infinite where the residual is no number."""
+    def _newton(self, r: np.ndarray, steps: list[np.ndarray]) -> tuple[np.ndarray, float]:
+        """(the next step to subtract, the size of A^-1 r in the norm of A); infinite where the residual is no number.
+        Broyden's update by the steps so far (Kelley 1995, sec. 7.3)."""
         if not np.isfinite(r).all():
             return r, np.inf
         step = self._matrix.solve(r)
-        return step, float(np.sqrt(abs(np.vdot(step, r))))
+        error = float(np.sqrt(abs(np.vdot(step, r))))
+        for s, after in zip(steps, steps[1:]):
+            step = step + after * (np.vdot(s, step) / np.vdot(s, s))
+        if steps:
+            step = step / (1 + np.vdot(steps[-1], step) / np.vdot(steps[-1], steps[-1]))
+        return step, error
 
     def _refresh(self, x, after: float, which: tuple) -> None:
         D = self.points.tangent((self.gradient @ x).reshape(-1, 3, 3), after)

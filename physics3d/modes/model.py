@@ -60,7 +60,7 @@ class Model:
         S = self.values[free]
         left = S.T * self.particle_mass[free]
         gram = left @ S
-        return np.linalg.solve(gram + 1e-12 * np.trace(gram) / len(gram) * np.eye(len(gram)), left)
+        return np.linalg.solve(gram + 1e-8 * np.trace(gram) / len(gram) * np.eye(len(gram)), left)
 
     @property
     def count(self) -> int:
