@@ -137,7 +137,7 @@ def start_up(steps: int, precision: str) -> Answer:
     """(tau_12, N1) at a shear of 4, shear rate 1/s: mu_N 2 Pa, lam_N 1 Pa, viscosities 10 Pa s."""
     values = dict(
         branch_shear_modulus=2.0, branch_bulk_modulus=1 + 4 / 3,
-        shear_viscosity_time=1 / 0.4, bulk_viscosity_time=1 / (0.2 * (1 + 4 / 3)),
+        shear_relaxation_time=1 / 0.4, bulk_relaxation_time=1 / (0.2 * (1 + 4 / 3)),
     )  # fmt: skip
     table = torch.linspace(0, 4, steps + 1, dtype=torch.float64)
     shear = table.to(torch.float32 if precision == "float32" else torch.float64)

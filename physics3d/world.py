@@ -10,6 +10,7 @@ from torch import Tensor
 from physics3d.artifact import AbstractArtifact, require_finite
 from physics3d.boundaries.base import AbstractBoundary, Vector
 from physics3d.materials.base import AbstractMaterial
+from physics3d.materials.parameters import check_old_names
 
 SCHEMES = ("auto", "explicit", "implicit")
 PRECISIONS = {"float32": torch.float32, "float64": torch.float64}
@@ -24,6 +25,7 @@ class Estimate(AbstractArtifact):
     history: dict[str, list[float]] = field(default_factory=dict)  # curves of the learning
 
     def check(self) -> None:
+        check_old_names(self.parameters)
         for name, value in self.parameters.items():
             require_finite(f"parameter {name}", value)
         require_finite("velocity", self.velocity)

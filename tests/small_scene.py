@@ -4,9 +4,9 @@ import torch
 
 from physics3d.boundaries.fixed_region import FixedRegion
 from physics3d.boundaries.impulse import Impulse
-from physics3d.filling.fill import Body
+from physics3d.filling.body import Body
 from physics3d.gaussians.cameras import Camera, look_at
-from physics3d.gaussians.deform import embed
+from physics3d.gaussians.embedding import embed
 from physics3d.gaussians.model import Gaussians
 from physics3d.learning.fields import GlobalField
 from physics3d.materials.viscoelastic import Viscoelastic
@@ -19,8 +19,8 @@ ELASTIC = {"youngs_modulus": 2e4, "poissons_ratio": 0.3}
 DAMPED = ELASTIC | {
     "branch_shear_modulus": 6e3,
     "branch_bulk_modulus": 6e3,
-    "shear_viscosity_time": 0.05,
-    "bulk_viscosity_time": 0.05,
+    "shear_relaxation_time": 0.05,
+    "bulk_relaxation_time": 0.05,
 }
 DX = 0.05
 POKE = (Impulse(force=(1.2, 0.0, 0.0), centre=(0.0, 0.0, 0.4), radius=0.12, start=0.0, duration=0.1),)

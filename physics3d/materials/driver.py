@@ -5,18 +5,15 @@ One row of the table is one step of the model, F_next = (I + dt L) F exactly. St
 parameters.
 """
 
-import functools
 import math
 
 import torch
-import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
-from physics3d.materials import spectral
-from physics3d.materials.base import AbstractMaterial, Values
-
-_REAL = {torch.float32: wp.float32, torch.float64: wp.float64}
+from physics3d.materials.base import AbstractMaterial
+from physics3d.materials.material_points import advance
+from physics3d.materials.parameters import Values
 
 
 def prescribed(
@@ -89,18 +86,6 @@ def uniaxial(
     return torch.stack(stress), torch.stack(lateral)
 
 
-def advance(
-    material: AbstractMaterial,
-    dt: float,
-    L: Float[Tensor, "n 3 3"],
-    H: Float[Tensor, "n 3 3"],
-    coefficients: Float[Tensor, "k n"],
-    memory: Float[Tensor, "m n"],
-) -> tuple[Float[Tensor, "n 3 3"], Float[Tensor, "n 3 3"], Float[Tensor, "m n"]]:
-    """One step of n material points: (H_next, tau [Pa], memory_next); all tensors of one dtype, differentiable."""
-    return _Advance.apply(material, dt, L, H, coefficients, memory)
-
-
 class _Sample:
     """One material point and its history."""
 
@@ -133,75 +118,3 @@ def _check_table(time: Tensor, table: Tensor, rest: Tensor) -> None:
         raise ValueError("time does not increase from row to row; sort the table and drop repeated rows")
     if not bool(torch.isfinite(table).all()) or not torch.equal(table[0], rest.to(table.dtype)):
         raise ValueError(f"the table starts at {table[0].tolist()}; it must be finite and start undeformed")
-
-
-@functools.cache
-def _kernel(function: wp.Function, real: type) -> wp.Kernel:
-    mat33 = spectral.matrix_type(real)
-
-    @wp.kernel(module="unique")
-    def material_points(
-        # in
-        dt: real,  # [s]
-        L: wp.array(dtype=mat33),  # velocity gradient [1/s]
-        H: wp.array(dtype=mat33),  # deformation minus identity
-        coefficients: wp.array2d(dtype=real),
-        memory: wp.array2d(dtype=real),
-        # out
-        H_next: wp.array(dtype=mat33),
-        tau: wp.array(dtype=mat33),  # Kirchhoff stress [Pa]
-        memory_next: wp.array2d(dtype=real),
-    ):
-        p = wp.tid()
-        H_p, tau_p = function(p, dt, L[p], H[p], coefficients, memory, memory_next)
-        H_next[p] = H_p
-        tau[p] = tau_p
-
-    return material_points
-
-
-class _Advance(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, material, dt, L, H, coefficients, memory):
-        wp.config.quiet = True
-        wp.init()
-        n, real = len(H), _REAL[H.dtype]
-        inputs = [t.detach().contiguous() for t in (L, H, coefficients.expand(-1, n), memory)]
-        outputs = [torch.zeros_like(t) for t in (inputs[1], inputs[1], inputs[3])]
-        ctx.launch = functools.partial(_launch, _kernel(material.advance(real), real), n, real(dt), real)
-        ctx.columns = coefficients.shape[1]
-        ctx.save_for_backward(*inputs, *outputs)
-        ctx.launch(inputs, outputs)
-        return tuple(outputs)
-
-    @staticmethod
-    def backward(ctx, *adj_outputs):
-        saved = list(ctx.saved_tensors)
-        adj_inputs = [torch.zeros_like(t) for t in saved[:4]]
-        ctx.launch(
-            saved[:4], saved[4:], adj_inputs, [t.clone(memory_format=torch.contiguous_format) for t in adj_outputs]
-        )
-        L, H, coefficients, memory = adj_inputs
-        if ctx.columns == 1:
-            coefficients = coefficients.sum(1, keepdim=True)
-        return None, None, L, H, coefficients, memory
-
-
-def _launch(kernel, n, dt, real, inputs, outputs, adj_inputs=None, adj_outputs=None):
-    mat33 = spectral.matrix_type(real)
-
-    def arrays(tensors, types):
-        return [wp.from_torch(t.detach(), dtype=kind) for t, kind in zip(tensors, types, strict=True)]
-
-    in_types, out_types = (mat33, mat33, real, real), (mat33, mat33, real)
-    adjoint = adj_inputs is not None
-    wp.launch(
-        kernel,
-        dim=n,
-        inputs=[dt, *arrays(inputs, in_types)],
-        outputs=arrays(outputs, out_types),
-        adj_inputs=[None, *arrays(adj_inputs, in_types)] if adjoint else [],
-        adj_outputs=arrays(adj_outputs, out_types) if adjoint else [],
-        adjoint=adjoint,
-        device=str(inputs[0].device),
-    )

@@ -22,11 +22,16 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
-from physics3d.materials import base, spectral
+from physics3d.materials.base import AbstractMaterial
+from physics3d.materials.parameters import Values, check_elastic, check_names, check_range, lame, rows
+from physics3d.materials.strain_memory import carried_strain, hencky_energy, store_strain
+from physics3d.materials.tensors import log_strain, scalars
+from physics3d.materials.tensors.replay import without_replay
+from physics3d.warp_types import matrix
 
 
 @dataclass(frozen=True, kw_only=True)
-class HerschelBulkley(base.AbstractMaterial):
+class HerschelBulkley(AbstractMaterial):
     """Parameters: youngs_modulus [Pa], poissons_ratio, yield_stress tau_y [Pa] in shear, consistency k [Pa s^n],
     flow_index n (below 1: the faster, the thinner)."""
 
@@ -48,17 +53,17 @@ class HerschelBulkley(base.AbstractMaterial):
     def memory_rows(self) -> int:
         return 6
 
-    def check_parameters(self, values: base.Values) -> None:
-        base.check_names(values, self.parameters)
-        base.check_elastic(values)
-        base.check_range(values, "yield_stress", 0.0)
-        base.check_range(values, "consistency", 0.0)
-        base.check_range(values, "flow_index", 0.0, 2.0)
+    def check_parameters(self, values: Values) -> None:
+        check_names(values, self.parameters)
+        check_elastic(values)
+        check_range(values, "yield_stress", 0.0)
+        check_range(values, "consistency", 0.0)
+        check_range(values, "flow_index", 0.0, 2.0)
 
-    def coefficients(self, values: base.Values) -> Float[Tensor, "5 n"]:
+    def coefficients(self, values: Values) -> Float[Tensor, "5 n"]:
         self.check_parameters(values)
-        mu, lam = base.lame(values["youngs_modulus"], values["poissons_ratio"])
-        return base.rows(mu, lam + 2 / 3 * mu, values["yield_stress"], values["consistency"], 1 / values["flow_index"])
+        mu, lam = lame(values["youngs_modulus"], values["poissons_ratio"])
+        return rows(mu, lam + 2 / 3 * mu, values["yield_stress"], values["consistency"], 1 / values["flow_index"])
 
     def wave_modulus(self, coefficients: Float[Tensor, "5 n"]) -> Float[Tensor, " n"]:
         return coefficients[1] + 4 / 3 * coefficients[0]
@@ -66,7 +71,7 @@ class HerschelBulkley(base.AbstractMaterial):
     def energy(
         self, coefficients: Float[Tensor, "5 n"], H: Float[Tensor, "n 3 3"], memory: Float[Tensor, "6 n"]
     ) -> Float[Tensor, " n"]:
-        return base.hencky_energy(coefficients[0], coefficients[1], memory)
+        return hencky_energy(coefficients[0], coefficients[1], memory)
 
     def advance(self, real: type) -> wp.Function:
         return _advance(real)
@@ -76,7 +81,7 @@ class HerschelBulkley(base.AbstractMaterial):
 def _decay(real: type) -> wp.Function:
     """decay(c, s) -> ln(1 + s c)/s, c itself for s = 0; at most `gone`, also where 1 + s c <= 0 (s < 0: the overstress
     is used up before the step ends)."""
-    log1p = spectral.log1p(real)
+    log1p = scalars.log1p(real)
     small = real(0.02 if real is wp.float32 else 0.003)  # y^6: 6e-11, 7e-16
     gone = real(60.0)
 
@@ -97,9 +102,9 @@ def _decay(real: type) -> wp.Function:
 
 @functools.cache
 def _advance(real: type) -> wp.Function:
-    mat33 = spectral.matrix_type(real)
-    relax, carried, store = spectral.relax_hencky(real), base.carried_strain(real), base.store_strain(real)
-    decay, expm1, log1p = _decay(real), spectral.expm1(real), spectral.log1p(real)
+    mat33 = matrix(real)
+    relax, carried, store = log_strain.relax(real), carried_strain(real), store_strain(real)
+    decay, expm1, log1p = _decay(real), scalars.expm1(real), scalars.log1p(real)
     root2 = real(math.sqrt(2))
     most, least = real(80.0), real(1e-20)  # e^80 is still a float32
 
@@ -152,4 +157,4 @@ def _advance(real: type) -> wp.Function:
         store(p, 0, X_next, memory_next)
         return H + M + M * H, real(2.0) * mu * wp.exp(-relaxed) * dev + real(3.0) * K * mean * one
 
-    return spectral.without_replay(advance)
+    return without_replay(advance)

@@ -16,13 +16,17 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
-from physics3d.materials import base, spectral
+from physics3d.materials.base import AbstractMaterial
+from physics3d.materials.parameters import Values, check_elastic, check_names, lame, rows
+from physics3d.materials.tensors import scalars, volume
+from physics3d.materials.tensors.replay import without_replay
+from physics3d.warp_types import matrix
 
 _FLOOR = 1e-4  # J
 
 
 @dataclass(frozen=True, kw_only=True)
-class NeoHookean(base.AbstractMaterial):
+class NeoHookean(AbstractMaterial):
     """Elastic; parameters youngs_modulus [Pa] and poissons_ratio."""
 
     @property
@@ -33,13 +37,13 @@ class NeoHookean(base.AbstractMaterial):
     def example(self) -> dict[str, float]:
         return {"youngs_modulus": 1e5, "poissons_ratio": 0.4}  # soft rubber
 
-    def check_parameters(self, values: base.Values) -> None:
-        base.check_names(values, self.parameters)
-        base.check_elastic(values)
+    def check_parameters(self, values: Values) -> None:
+        check_names(values, self.parameters)
+        check_elastic(values)
 
-    def coefficients(self, values: base.Values) -> Float[Tensor, "2 n"]:
+    def coefficients(self, values: Values) -> Float[Tensor, "2 n"]:
         self.check_parameters(values)
-        return base.rows(*base.lame(values["youngs_modulus"], values["poissons_ratio"]))
+        return rows(*lame(values["youngs_modulus"], values["poissons_ratio"]))
 
     def wave_modulus(self, coefficients: Float[Tensor, "2 n"]) -> Float[Tensor, " n"]:
         mu, lam = coefficients
@@ -64,9 +68,9 @@ class NeoHookean(base.AbstractMaterial):
 
 @functools.cache
 def _advance(real: type) -> wp.Function:
-    mat33 = spectral.matrix_type(real)
-    volume_change = spectral.volume_change(real)
-    log1p_extended = spectral.log1p_extended(real, _FLOOR)
+    mat33 = matrix(real)
+    volume_change = volume.volume_change(real)
+    log1p_extended = scalars.log1p_extended(real, _FLOOR)
 
     @wp.func(name=f"neo_hookean_{real.__name__}")
     def advance(
@@ -85,4 +89,4 @@ def _advance(real: type) -> wp.Function:
         tau = coefficients[0, p] * X + coefficients[1, p] * log_J * wp.identity(n=3, dtype=real)
         return H_next, tau
 
-    return spectral.without_replay(advance)
+    return without_replay(advance)

@@ -15,13 +15,17 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
-from physics3d.materials import base, spectral
+from physics3d.materials.base import AbstractMaterial
+from physics3d.materials.parameters import Values, check_names, check_range, rows
+from physics3d.materials.tensors import volume
+from physics3d.materials.tensors.replay import without_replay
+from physics3d.warp_types import matrix
 
 _LEAST_RATE = 1e-3  # g_0 [1/s]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Newtonian(base.AbstractMaterial):
+class Newtonian(AbstractMaterial):
     """Parameters: bulk_modulus [Pa], viscosity k [Pa s^n], power_index n."""
 
     @property
@@ -36,15 +40,15 @@ class Newtonian(base.AbstractMaterial):
     def memory_rows(self) -> int:
         return 1
 
-    def check_parameters(self, values: base.Values) -> None:
-        base.check_names(values, self.parameters)
-        base.check_range(values, "bulk_modulus", 0.0)
-        base.check_range(values, "viscosity", 0.0, closed=True)
-        base.check_range(values, "power_index", 0.0, 2.0, closed=True)
+    def check_parameters(self, values: Values) -> None:
+        check_names(values, self.parameters)
+        check_range(values, "bulk_modulus", 0.0)
+        check_range(values, "viscosity", 0.0, closed=True)
+        check_range(values, "power_index", 0.0, 2.0, closed=True)
 
-    def coefficients(self, values: base.Values) -> Float[Tensor, "3 n"]:
+    def coefficients(self, values: Values) -> Float[Tensor, "3 n"]:
         self.check_parameters(values)
-        return base.rows(*(values[name] for name in self.parameters))
+        return rows(*(values[name] for name in self.parameters))
 
     def wave_modulus(self, coefficients: Float[Tensor, "3 n"]) -> Float[Tensor, " n"]:
         return coefficients[0]
@@ -66,8 +70,8 @@ class Newtonian(base.AbstractMaterial):
 
 @functools.cache
 def _advance(real: type) -> wp.Function:
-    mat33 = spectral.matrix_type(real)
-    volume_change = spectral.volume_change(real)
+    mat33 = matrix(real)
+    volume_change = volume.volume_change(real)
     least2 = real(_LEAST_RATE**2)
 
     @wp.func(name=f"newtonian_{real.__name__}")
@@ -90,4 +94,4 @@ def _advance(real: type) -> wp.Function:
         eta = coefficients[1, p] * wp.pow(g2, real(0.5) * (coefficients[2, p] - real(1.0)))
         return H + M + M * H, coefficients[0, p] * J * j * one + real(2.0) * eta * wp.max(J, real(0.0)) * D
 
-    return spectral.without_replay(advance)
+    return without_replay(advance)

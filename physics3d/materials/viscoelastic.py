@@ -10,10 +10,8 @@ One substep of a branch (Strang): b_N is carried by the flow, the stress is take
 fully relaxed strain is stored as X = b_N - I. Second order in dt, stable for every dt k; the stored strain is half a
 step ahead.
 
-`spring="neo_hookean"` replaces the Hencky spring, whose shear stress falls beyond a shear of 3, by
-tau_N = mu_N dev(b~) + K_N ln J_N I, b~ = J_N^(-2/3) b_N, with d eps/dt = -(k_d/2) dev(b~) (Reese and Govindjee 1998).
-Along that flow b~^-1 stays on the ray b~_0^-1 + s I scaled to determinant one, ds/dt = k_d det(b~_0^-1 + s I)^(1/3); s
-is taken from its expansion s = (exp(m k_d t) - 1)/m, m = tr(b~_0)/3: no eigendecomposition, the same order.
+`spring="neo_hookean"` replaces the Hencky spring, whose shear stress falls beyond a shear of 3
+(`neo_hookean_branch.py`).
 
 Liu et al. (arXiv 2406.04338); where and why we depart from it: docs/method.md.
 """
@@ -27,13 +25,19 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
-from physics3d.materials import base, spectral
+from physics3d.materials.base import AbstractMaterial
+from physics3d.materials.neo_hookean_branch import maxwell_neo_hookean
+from physics3d.materials.parameters import Values, check_elastic, check_names, check_range, lame, rows
+from physics3d.materials.strain_memory import carried_strain, hencky_energy, principal_log_strain, store_strain
+from physics3d.materials.tensors import log_strain, polar, volume
+from physics3d.materials.tensors.replay import without_replay
+from physics3d.warp_types import matrix
 
 
 @dataclass(frozen=True, kw_only=True)
-class Viscoelastic(base.AbstractMaterial):
+class Viscoelastic(AbstractMaterial):
     """Parameters: youngs_modulus [Pa], poissons_ratio, and for every branch branch_shear_modulus (mu_N),
-    branch_bulk_modulus (K_N) [Pa], shear_viscosity_time (1/k_d), bulk_viscosity_time (1/k_v) [s, inf: never relaxes];
+    branch_bulk_modulus (K_N) [Pa], shear_relaxation_time (1/k_d), bulk_relaxation_time (1/k_v) [s, inf: never relaxes];
     those of further branches end in _2, _3.
 
     Raises ValueError for a number of branches outside 0..3, an unknown spring, or nothing at all.
@@ -73,23 +77,23 @@ class Viscoelastic(base.AbstractMaterial):
     def memory_rows(self) -> int:
         return 6 * self.branches
 
-    def check_parameters(self, values: base.Values) -> None:
-        base.check_names(values, self.parameters)
+    def check_parameters(self, values: Values) -> None:
+        check_names(values, self.parameters)
         if self.elastic:
-            base.check_elastic(values)
+            check_elastic(values)
         for suffix in self._suffixes:
             for name in ("branch_shear_modulus", "branch_bulk_modulus"):
-                base.check_range(values, name + suffix, 0.0)
-            for name in ("shear_viscosity_time", "bulk_viscosity_time"):
-                base.check_range(values, name + suffix, 1e-30, closed=True)
+                check_range(values, name + suffix, 0.0)
+            for name in ("shear_relaxation_time", "bulk_relaxation_time"):
+                check_range(values, name + suffix, 1e-30, closed=True)
 
-    def coefficients(self, values: base.Values) -> Float[Tensor, "k n"]:
+    def coefficients(self, values: Values) -> Float[Tensor, "k n"]:
         self.check_parameters(values)
-        found = list(base.lame(values["youngs_modulus"], values["poissons_ratio"])) if self.elastic else []
+        found = list(lame(values["youngs_modulus"], values["poissons_ratio"])) if self.elastic else []
         for suffix in self._suffixes:
             mu, K, shear_time, bulk_time = (values[name + suffix] for name in _BRANCH)
             found += [mu, K, 1 / shear_time, 1 / bulk_time]
-        return base.rows(*found)
+        return rows(*found)
 
     def wave_modulus(self, coefficients: Float[Tensor, "k n"]) -> Float[Tensor, " n"]:
         total = torch.zeros_like(coefficients[0])
@@ -111,15 +115,15 @@ class Viscoelastic(base.AbstractMaterial):
         psi = torch.zeros_like(H[:, 0, 0])
         if self.elastic:
             mu, lam = coefficients[:2]
-            J = spectral.determinant(one + H)
-            psi = psi + mu * spectral.stretch_distance(H) + lam / 2 * (J - 1) ** 2
+            J = volume.determinant(one + H)
+            psi = psi + mu * polar.stretch_distance(H) + lam / 2 * (J - 1) ** 2
         for i in range(self.branches):
             mu, K = coefficients[self._first(i) : self._first(i) + 2]
             strain = memory[6 * i : 6 * i + 6]
             if self.spring == "hencky":
-                psi = psi + base.hencky_energy(mu, K, strain)
+                psi = psi + hencky_energy(mu, K, strain)
             else:
-                dev, log_J = base.log_strain(strain)
+                dev, log_J = principal_log_strain(strain)
                 psi = psi + mu / 2 * torch.expm1(2 * dev).sum(1) + K / 2 * log_J**2
         return psi
 
@@ -127,41 +131,51 @@ class Viscoelastic(base.AbstractMaterial):
         return _advance(self.branches, self.elastic, self.spring, real)
 
 
-_BRANCH = ("branch_shear_modulus", "branch_bulk_modulus", "shear_viscosity_time", "bulk_viscosity_time")
+_BRANCH = ("branch_shear_modulus", "branch_bulk_modulus", "shear_relaxation_time", "bulk_relaxation_time")
 
 
 @functools.cache
-def _neo_hookean(real: type) -> wp.Function:
-    """As `spectral.maxwell_hencky`. b~ = I + B, b~^-1 = I + W; W/(1 + s) is W relaxed before it is scaled to
-    determinant one."""
-    mat33 = spectral.matrix_type(real)
-    log_det, expm1 = spectral.log_det(real), spectral.expm1(real)
-    unimodular_inverse = spectral.unimodular_inverse(real)
+def maxwell_hencky(real: type) -> wp.Function:
+    """One step of a Hencky spring in series with a dash-pot, from the carried strain X = b - I, eps = 1/2 ln(I + X).
 
-    @wp.func(name=f"maxwell_neo_hookean_{real.__name__}")
+        maxwell(X, mu, K, d, v) -> (tau, X_next)      d, v = dt k_d, dt k_v
+        tau    = 2 mu e^{-d/2} dev eps + K e^{-v/2} tr(eps) I                                    [Pa], as mu and K
+        X_next = exp(2 [e^{-d} dev eps + e^{-v} tr(eps)/3 I]) - I
+
+    Relaxation enters as expm1, so a slow one is an exact small increment of X and none leaves X as it is.
+    `without_replay`.
+    """
+    mat33 = matrix(real)
+    relaxed, adjoint = log_strain.relaxed(real), log_strain.adjoint_of_relaxed(real)
+
+    @wp.func(name=f"maxwell_hencky_{real.__name__}")
     def maxwell(X: mat33, mu: real, K: real, d: real, v: real):
-        one = wp.identity(n=3, dtype=real)
-        log_J = real(0.5) * log_det(X)
-        W = unimodular_inverse(X)
-        m = wp.max(real(1.0) + wp.trace(unimodular_inverse(W)) / real(3.0), real(1.0))
-        half = unimodular_inverse(W / (real(1.0) + expm1(wp.min(real(0.5) * m * d, real(60.0))) / m))
-        full = unimodular_inverse(W / (real(1.0) + expm1(wp.min(m * d, real(60.0))) / m))
-        tau = mu * (half - wp.trace(half) / real(3.0) * one) + K * wp.exp(-real(0.5) * v) * log_J * one
-        g = expm1(real(2.0) / real(3.0) * wp.exp(-v) * log_J)
-        return tau, (real(1.0) + g) * full + g * one
+        tau, X_next = relaxed(X, mu, K, d, v)
+        return tau, X_next
 
-    return maxwell
+    @wp.func_grad(maxwell)
+    def adj_maxwell(X: mat33, mu: real, K: real, d: real, v: real, adj_tau: mat33, adj_X_next: mat33):
+        dh, vh = wp.exp(-real(0.5) * d), wp.exp(-real(0.5) * v)
+        shear, df, vf = real(2.0) * mu * dh, dh * dh, vh * vh
+        adj_X, dev_a, dev_b, mean, a, b = adjoint(X, shear, K * vh, df, vf, adj_tau, adj_X_next)
+        wp.adjoint[X] += adj_X
+        wp.adjoint[mu] += real(2.0) * dh * dev_a
+        wp.adjoint[K] += real(3.0) * vh * mean * a
+        wp.adjoint[d] += -real(0.5) * shear * dev_a - df * dev_b
+        wp.adjoint[v] += -real(1.5) * K * vh * mean * a - vf * mean * b
+
+    return without_replay(maxwell)
 
 
-_MAXWELL = {"hencky": spectral.maxwell_hencky, "neo_hookean": _neo_hookean}
+_MAXWELL = {"hencky": maxwell_hencky, "neo_hookean": maxwell_neo_hookean}
 
 
 @functools.cache
 def _corotated(real: type) -> wp.Function:
     """corotated(H, mu, lam) -> stress of the elastic branch."""
-    mat33 = spectral.matrix_type(real)
-    volume_change, cofactor = spectral.volume_change(real), spectral.cofactor(real)
-    stretch, adjoint_of_stretch = spectral.stretch(real), spectral.adjoint_of_stretch(real)
+    mat33 = matrix(real)
+    volume_change, cofactor = volume.volume_change(real), volume.cofactor(real)
+    stretch, adjoint_of_stretch = polar.stretch(real), polar.adjoint_of_stretch(real)
 
     @wp.func(name=f"corotated_{real.__name__}")
     def corotated(H: mat33, mu: real, lam: real):
@@ -183,16 +197,16 @@ def _corotated(real: type) -> wp.Function:
         wp.adjoint[mu] += real(2.0) * (wp.trace(AY) + wp.ddot(AY, Y))
         wp.adjoint[lam] += (real(1.0) + j) * j * trace
 
-    return spectral.without_replay(corotated)
+    return without_replay(corotated)
 
 
 @functools.cache
 def maxwell_branches(branches: int, spring: str, real: type) -> wp.Function:
     """all(p, dt, M, first, row, coefficients, memory, memory_next) -> stress of the branches, carried by I + M and
     relaxed over dt; their coefficients begin at row `first`, their memory at `row`."""
-    mat33 = spectral.matrix_type(real)
+    mat33 = matrix(real)
     maxwell = _MAXWELL[spring](real)
-    carried, store = base.carried_strain(real), base.store_strain(real)
+    carried, store = carried_strain(real), store_strain(real)
 
     @wp.func(name=f"maxwell_branches_{branches}_{spring}_{real.__name__}")
     def all_branches(
@@ -215,12 +229,12 @@ def maxwell_branches(branches: int, spring: str, real: type) -> wp.Function:
             tau = tau + tau_N
         return tau
 
-    return spectral.without_replay(all_branches)
+    return without_replay(all_branches)
 
 
 @functools.cache
 def _advance(branches: int, elastic: bool, spring: str, real: type) -> wp.Function:
-    mat33 = spectral.matrix_type(real)
+    mat33 = matrix(real)
     corotated = _corotated(real)
     all_branches = maxwell_branches(branches, spring, real)
     key = f"{branches}_{'elastic' if elastic else 'viscous'}_{spring}_{real.__name__}"
@@ -245,4 +259,4 @@ def _advance(branches: int, elastic: bool, spring: str, real: type) -> wp.Functi
             tau = tau + all_branches(p, dt, M, first, 0, coefficients, memory, memory_next)
         return H_next, tau
 
-    return spectral.without_replay(advance)
+    return without_replay(advance)

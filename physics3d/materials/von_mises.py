@@ -15,11 +15,16 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
-from physics3d.materials import base, spectral
+from physics3d.materials.base import AbstractMaterial
+from physics3d.materials.parameters import Values, check_elastic, check_names, check_range, lame, rows
+from physics3d.materials.strain_memory import carried_strain, hencky_energy, store_strain
+from physics3d.materials.tensors import log_strain
+from physics3d.materials.tensors.replay import without_replay
+from physics3d.warp_types import matrix
 
 
 @dataclass(frozen=True, kw_only=True)
-class VonMises(base.AbstractMaterial):
+class VonMises(AbstractMaterial):
     """Parameters: youngs_modulus [Pa], poissons_ratio, yield_stress [Pa] in tension, hardening_modulus [Pa]."""
 
     @property
@@ -34,16 +39,16 @@ class VonMises(base.AbstractMaterial):
     def memory_rows(self) -> int:
         return 7
 
-    def check_parameters(self, values: base.Values) -> None:
-        base.check_names(values, self.parameters)
-        base.check_elastic(values)
-        base.check_range(values, "yield_stress", 0.0)
-        base.check_range(values, "hardening_modulus", 0.0, closed=True)
+    def check_parameters(self, values: Values) -> None:
+        check_names(values, self.parameters)
+        check_elastic(values)
+        check_range(values, "yield_stress", 0.0)
+        check_range(values, "hardening_modulus", 0.0, closed=True)
 
-    def coefficients(self, values: base.Values) -> Float[Tensor, "4 n"]:
+    def coefficients(self, values: Values) -> Float[Tensor, "4 n"]:
         self.check_parameters(values)
-        mu, lam = base.lame(values["youngs_modulus"], values["poissons_ratio"])
-        return base.rows(mu, lam + 2 / 3 * mu, values["yield_stress"], values["hardening_modulus"])
+        mu, lam = lame(values["youngs_modulus"], values["poissons_ratio"])
+        return rows(mu, lam + 2 / 3 * mu, values["yield_stress"], values["hardening_modulus"])
 
     def wave_modulus(self, coefficients: Float[Tensor, "4 n"]) -> Float[Tensor, " n"]:
         return coefficients[1] + 4 / 3 * coefficients[0]
@@ -53,7 +58,7 @@ class VonMises(base.AbstractMaterial):
     ) -> Float[Tensor, " n"]:
         """With the energy stored in hardening."""
         mu, K, _, h = coefficients
-        return base.hencky_energy(mu, K, memory[:6]) + h / 2 * memory[6] ** 2
+        return hencky_energy(mu, K, memory[:6]) + h / 2 * memory[6] ** 2
 
     def advance(self, real: type) -> wp.Function:
         return _advance(real)
@@ -61,8 +66,8 @@ class VonMises(base.AbstractMaterial):
 
 @functools.cache
 def _advance(real: type) -> wp.Function:
-    mat33 = spectral.matrix_type(real)
-    relax, carried, store = spectral.relax_hencky(real), base.carried_strain(real), base.store_strain(real)
+    mat33 = matrix(real)
+    relax, carried, store = log_strain.relax(real), carried_strain(real), store_strain(real)
     root = real((2 / 3) ** 0.5)
 
     @wp.func(name=f"von_mises_return_{real.__name__}")
@@ -101,4 +106,4 @@ def _advance(real: type) -> wp.Function:
         tau = real(2.0) * mu * wp.exp(-shrink) * (eps - mean * one) + real(3.0) * coefficients[1, p] * mean * one
         return H + M + M * H, tau
 
-    return spectral.without_replay(advance)
+    return without_replay(advance)

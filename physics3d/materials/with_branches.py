@@ -14,19 +14,22 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
-from physics3d.materials import base, spectral
+from physics3d.materials.base import AbstractMaterial, coefficient_rows
 from physics3d.materials.neo_hookean import NeoHookean
+from physics3d.materials.parameters import Values, check_names, rows
+from physics3d.materials.tensors.replay import without_replay
 from physics3d.materials.viscoelastic import Viscoelastic, maxwell_branches
+from physics3d.warp_types import matrix
 
 
 @dataclass(frozen=True, kw_only=True)
-class WithBranches(base.AbstractMaterial):
+class WithBranches(AbstractMaterial):
     """Parameters: those of the solid, then those of the branches as in `Viscoelastic`.
 
     Raises ValueError for a number of branches outside 1..3, an unknown spring, or a solid that has branches already.
     """
 
-    solid: base.AbstractMaterial = field(default_factory=NeoHookean)
+    solid: AbstractMaterial = field(default_factory=NeoHookean)
     branches: int = 1
     spring: Literal["hencky", "neo_hookean"] = "hencky"
 
@@ -53,18 +56,18 @@ class WithBranches(base.AbstractMaterial):
     def memory_rows(self) -> int:
         return self.solid.memory_rows + self._maxwell.memory_rows
 
-    def check_parameters(self, values: base.Values) -> None:
-        base.check_names(values, self.parameters)
+    def check_parameters(self, values: Values) -> None:
+        check_names(values, self.parameters)
         for material in (self.solid, self._maxwell):
             material.check_parameters({name: values[name] for name in material.parameters})
 
-    def coefficients(self, values: base.Values) -> Float[Tensor, "k n"]:
-        base.check_names(values, self.parameters)
+    def coefficients(self, values: Values) -> Float[Tensor, "k n"]:
+        check_names(values, self.parameters)
         solid, maxwell = (
             material.coefficients({name: values[name] for name in material.parameters})
             for material in (self.solid, self._maxwell)
         )
-        return base.rows(*solid, *maxwell)
+        return rows(*solid, *maxwell)
 
     def wave_modulus(self, coefficients: Float[Tensor, "k n"]) -> Float[Tensor, " n"]:
         solid, maxwell = self._split(coefficients)
@@ -88,15 +91,13 @@ class WithBranches(base.AbstractMaterial):
         return coefficients[:first], coefficients[first:]
 
     def advance(self, real: type) -> wp.Function:
-        rows = base.coefficient_rows(self.solid), self.solid.memory_rows
-        return _advance(self.solid.advance(real), *rows, self.branches, self.spring, real)
+        given = coefficient_rows(self.solid), self.solid.memory_rows
+        return _advance(self.solid.advance(real), *given, self.branches, self.spring, real)
 
 
 @functools.cache
-def _advance(
-    solid: wp.Function, coefficient_rows: int, memory_rows: int, branches: int, spring: str, real: type
-) -> wp.Function:
-    mat33 = spectral.matrix_type(real)
+def _advance(solid: wp.Function, first: int, row: int, branches: int, spring: str, real: type) -> wp.Function:
+    mat33 = matrix(real)
     all_branches = maxwell_branches(branches, spring, real)
 
     @wp.func(name=f"{solid.key}_with_{branches}_{spring}")
@@ -110,7 +111,7 @@ def _advance(
         memory_next: wp.array2d(dtype=real),
     ):
         H_next, tau = solid(p, dt, L, H, coefficients, memory, memory_next)
-        tau_N = all_branches(p, dt, dt * L, coefficient_rows, memory_rows, coefficients, memory, memory_next)
+        tau_N = all_branches(p, dt, dt * L, first, row, coefficients, memory, memory_next)
         return H_next, tau + tau_N
 
-    return spectral.without_replay(advance)
+    return without_replay(advance)

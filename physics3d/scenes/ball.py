@@ -39,8 +39,8 @@ class BallTwin(AbstractSource):
     poissons_ratio: float = 0.3
     branch_shear_modulus: float = 1.2e3  # mu_N [Pa]
     branch_bulk_modulus: float = 2.0e3  # K_N [Pa]
-    shear_viscosity_time: float = 0.05  # 1/k_d [s]
-    bulk_viscosity_time: float = 0.05  # 1/k_v [s]
+    shear_relaxation_time: float = 0.05  # 1/k_d [s]
+    bulk_relaxation_time: float = 0.05  # 1/k_v [s]
     density: float = 300.0  # [kg/m^3]
     gravity: float = 9.81  # downward [m/s^2]
     # how the reference motion is computed: finer than the pipeline

@@ -44,8 +44,8 @@ class CarnationTwin(AbstractSource):
     poissons_ratio: float = 0.3
     branch_shear_modulus: float = 3.0e4  # mu_N [Pa]
     branch_bulk_modulus: float = 6.5e4  # K_N, of the same Poisson ratio [Pa]
-    shear_viscosity_time: float = 0.15  # 1/k_d [s]
-    bulk_viscosity_time: float = 0.15  # 1/k_v [s]
+    shear_relaxation_time: float = 0.15  # 1/k_d [s]
+    bulk_relaxation_time: float = 0.15  # 1/k_v [s]
     density: float = 300.0  # petals hold much air [kg/m^3]
     # how the reference motion is computed: finer than the pipeline
     dx: float = 0.010  # cell of the grid [m]

@@ -1,4 +1,4 @@
-"""Known answers on the test machine without a grid (docs/method.md, section 5, 1 to 5; yield, friction, viscosity)."""
+"""Known answers of the driver without a grid: docs/method.md, section 9, 1 to 5; yield, friction, viscosity."""
 
 import itertools
 import math
@@ -10,6 +10,7 @@ from mpm_bodies import every_material
 from physics3d.materials import driver
 from physics3d.materials.drucker_prager import DruckerPrager
 from physics3d.materials.herschel_bulkley import HerschelBulkley
+from physics3d.materials.material_points import advance
 from physics3d.materials.neo_hookean import NeoHookean
 from physics3d.materials.newtonian import Newtonian
 from physics3d.materials.snow import Snow
@@ -27,7 +28,7 @@ def numbers(**values):
 
 def branch(mu, K, k_d, k_v):
     return numbers(
-        branch_shear_modulus=mu, branch_bulk_modulus=K, shear_viscosity_time=1 / k_d, bulk_viscosity_time=1 / k_v
+        branch_shear_modulus=mu, branch_bulk_modulus=K, shear_relaxation_time=1 / k_d, bulk_relaxation_time=1 / k_v
     )
 
 
@@ -186,7 +187,7 @@ def test_tension_is_differentiable_with_respect_to_the_material():
 
     def last(E, mu, tau_d):
         values = branch(1.0, 3.0, 1.0, 1.0) | numbers(poissons_ratio=0.3)
-        values |= {"youngs_modulus": E, "branch_shear_modulus": mu, "shear_viscosity_time": tau_d}
+        values |= {"youngs_modulus": E, "branch_shear_modulus": mu, "shear_relaxation_time": tau_d}
         stress, lateral = driver.uniaxial(material, values, time, 1 + 0.4 * time)
         return stress[-1] + lateral[-1]
 
@@ -287,7 +288,7 @@ def test_snow_pulled_one_way_and_squeezed_the_others_gains_no_energy():
     rate = torch.diag(torch.tensor([1.0, -1.5, -1.5], dtype=torch.float64))[None]
     before = torch.zeros_like(H)
     for _ in range(400):
-        H, tau, memory = driver.advance(Snow(), 1.0, 2e-4 * rate, H, c, memory)
+        H, tau, memory = advance(Snow(), 1.0, 2e-4 * rate, H, c, memory)
         power = (0.5 * (tau + before) * 2e-4 * rate).sum().item()
         work, before = work + power, tau
         assert power > -1e-9

@@ -65,7 +65,9 @@ def test_solution_of_the_explicit_scheme_as_the_step_shrinks(material):
     """First order: half the step, half the difference. Both with the same step, for the transfers damp what lives below
     a cell by as much in each of them."""
     position, volume = block((4, 1, 1), DX)
-    branch = dict(branch_shear_modulus=4e3, branch_bulk_modulus=8e3, shear_viscosity_time=0.2, bulk_viscosity_time=0.5)
+    branch = dict(
+        branch_shear_modulus=4e3, branch_bulk_modulus=8e3, shear_relaxation_time=0.2, bulk_relaxation_time=0.5
+    )
     start = dict(youngs_modulus=1e4, poissons_ratio=0.3) | (branch if isinstance(material, Viscoelastic) else {})
     world = soft_world(material=material, start=start, boundaries=(CLAMP,))
     velocity = torch.zeros_like(position)

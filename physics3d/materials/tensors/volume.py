@@ -1,0 +1,114 @@
+"""Change of volume: J - 1 of F = I + H, its derivative, and what is left of a strain when the volume is taken out.
+
+    J - 1 = tr H + (principal minors of H) + det H,   dJ/dF = cof F = J F^-T,   A -> det(A)^(1/3) A^-1
+
+Bonet and Wood (2008), sec. 4.5 and 4.9.
+"""
+
+import functools
+import math
+
+import torch
+import warp as wp
+from jaxtyping import Float
+from torch import Tensor
+
+from physics3d.materials.tensors.scalars import expm1, log1p
+from physics3d.warp_types import matrix
+
+
+@functools.cache
+def volume_change(real: type) -> wp.Function:
+    """J - 1 of F = I + H without cancellation: tr H + the principal minors of H + det H."""
+    mat33 = matrix(real)
+
+    @wp.func(name=f"volume_change_{real.__name__}")
+    def volume_change(H: mat33):
+        minors = (
+            H[0, 0] * H[1, 1]
+            - H[0, 1] * H[1, 0]
+            + H[1, 1] * H[2, 2]
+            - H[1, 2] * H[2, 1]
+            + H[2, 2] * H[0, 0]
+            - H[2, 0] * H[0, 2]
+        )
+        return H[0, 0] + H[1, 1] + H[2, 2] + minors + wp.determinant(H)
+
+    return volume_change
+
+
+@functools.cache
+def cofactor(real: type) -> wp.Function:
+    """dJ/dF = J F^-T, defined for singular F too."""
+    mat33 = matrix(real)
+
+    @wp.func(name=f"cofactor_{real.__name__}")
+    def cofactor(F: mat33):
+        a, b, c = F[0], F[1], F[2]
+        return wp.matrix_from_rows(wp.cross(b, c), wp.cross(c, a), wp.cross(a, b))
+
+    return cofactor
+
+
+@functools.cache
+def log_det(real: type) -> wp.Function:
+    """ln det(I + X) of a positive semidefinite I + X, its tangent below det = 1e-12 (all lengths a hundredth), or below
+    what rounding leaves of the determinant of very unequal stretches."""
+    mat33 = matrix(real)
+    volume_change_, cofactor_, log1p_ = volume_change(real), cofactor(real), log1p(real)
+    round_off = real(5e-7 if real is wp.float32 else 1e-15)
+
+    @wp.func(name=f"least_det_{real.__name__}")
+    def least(A: mat33, C: mat33):
+        return wp.max(real(1e-12), round_off * wp.sqrt(wp.ddot(A, A)) * wp.sqrt(wp.ddot(C, C)))
+
+    @wp.func(name=f"log_det_{real.__name__}")
+    def log_det(X: mat33):
+        change = volume_change_(X)
+        if wp.ddot(X, X) < real(0.1):
+            return log1p_(change)
+        A = wp.identity(n=3, dtype=real) + X
+        det = wp.determinant(A)
+        floor = least(A, cofactor_(A))
+        above = wp.max(det, floor)
+        return wp.log(above) + (det - above) / floor
+
+    @wp.func_grad(log_det)
+    def adj_log_det(X: mat33, adj_ret: real):
+        A = wp.identity(n=3, dtype=real) + X
+        C = cofactor_(A)
+        wp.adjoint[X] += adj_ret / wp.max(wp.determinant(A), least(A, C)) * C
+
+    return log_det
+
+
+@functools.cache
+def unimodular_inverse(real: type) -> wp.Function:
+    """det(A)^(1/3) A^-1 - I of a positive semidefinite A = I + X."""
+    mat33 = matrix(real)
+    log_det_, cofactor_, expm1_ = log_det(real), cofactor(real), expm1(real)
+    lowest = real(math.log(1e-12))
+
+    @wp.func(name=f"unimodular_inverse_{real.__name__}")
+    def unimodular_inverse(X: mat33):
+        one = wp.identity(n=3, dtype=real)
+        A = one + X
+        third = wp.max(log_det_(X), lowest) / real(3.0)
+        if wp.ddot(X, X) < real(0.1):
+            c = expm1_(third)
+            return c * one - (real(1.0) + c) * (X * wp.inverse(A))
+        return wp.exp(-real(2.0) * third) * cofactor_(A) - one  # cof A = det(A) A^-1: A is symmetric
+
+    @wp.func_grad(unimodular_inverse)
+    def adj_unimodular_inverse(X: mat33, adj_ret: mat33):
+        Z = wp.identity(n=3, dtype=real) + unimodular_inverse(X)
+        G = real(0.5) * (adj_ret + wp.transpose(adj_ret))
+        scale = wp.exp(-wp.max(log_det_(X), lowest) / real(3.0))
+        wp.adjoint[X] += scale * (wp.ddot(G, Z) / real(3.0) * Z - Z * G * Z)
+
+    return unimodular_inverse
+
+
+def determinant(A: Float[Tensor, "n 3 3"]) -> Float[Tensor, " n"]:
+    """Of many matrices at once, which torch takes one by one."""
+    return (torch.linalg.cross(A[:, 0], A[:, 1]) * A[:, 2]).sum(1)
