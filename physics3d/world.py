@@ -12,6 +12,7 @@ from physics3d.boundaries.base import AbstractBoundary, Vector
 from physics3d.materials.base import AbstractMaterial
 from physics3d.materials.parameters import check_old_names
 
+SOLVERS = ("auto", "grid", "modes")
 SCHEMES = ("auto", "explicit", "implicit")
 PRECISIONS = {"float32": torch.float32, "float64": torch.float64}
 
@@ -43,6 +44,7 @@ class World:
     velocity: Vector = (0.0, 0.0, 0.0)  # of the body at the start [m/s]; learning may refine it
     boundaries: tuple[AbstractBoundary, ...] = ()
     damping: float = 0.0  # rate at which all velocities decay [1/s]
+    solver: str = "auto"  # grid, modes (held or free bodies that touch nothing), or auto: modes where they serve
     cfl: float = 0.5  # cells a wave crosses in one automatic substep
     dt: float | None = None  # substep [s]; None: from the speed of sound and of the particles
     scheme: str = "auto"  # explicit: follows every wave; implicit: damps those faster than dt; auto: the cheaper one
@@ -59,6 +61,7 @@ class World:
         _require(0 < self.cfl <= 1, "cfl", self.cfl, "0 < cfl <= 1")
         _require(0 <= self.damping < math.inf, "damping", self.damping, "a rate >= 0 1/s")
         _require(self.dt is None or self.dt > 0, "dt", self.dt, "a time above 0 s, or None")
+        _require(self.solver in SOLVERS, "solver", self.solver, f"one of {SOLVERS}")
         _require(self.scheme in SCHEMES, "scheme", self.scheme, f"one of {SCHEMES}")
         _require(self.max_substeps >= 1, "max_substeps", self.max_substeps, "at least 1")
         enough = self.checkpoint_bytes is None or self.checkpoint_bytes >= 0

@@ -10,7 +10,7 @@ from physics3d.boundaries.base import AbstractBoundary
 from physics3d.boundaries.impulse import Impulse
 from physics3d.filling.body import Body
 from physics3d.log import Log
-from physics3d.mpm.rollout import rollout
+from physics3d.solver import motion_of
 from physics3d.trajectory import Trajectory
 from physics3d.world import Estimate, World
 
@@ -31,17 +31,20 @@ class Simulate:
         if not 0 < self.fps < math.inf:
             raise ValueError(f"simulate.fps is {self.fps}; take a rate above 0 1/s")
         with torch.no_grad():
-            trajectory = rollout(
+            part = lambda values: self.world.material.per_part(values, body.part, body.parts)
+            motion = motion_of(
                 self.world,
-                self.world.material.per_part(estimate.parameters, body.part, body.parts),
                 body.position,
                 body.volume,
-                velocity=estimate.velocity,
                 excitation=(*body.held(self.world.boundaries), *excited(self.excitation, self.force)),
-                frames=self.frames,
-                frame_dt=1 / self.fps,
+                part=part,
+                matter=body.matter,
                 device=self.device,
                 log=log,
+            )
+            parameters = part(estimate.parameters)
+            trajectory = motion(
+                parameters, velocity=estimate.velocity, frames=self.frames, frame_dt=1 / self.fps, log=log
             )
         trajectory = _on_cpu(trajectory)
         for name, curve in trajectory.health.items():

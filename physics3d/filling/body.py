@@ -10,6 +10,7 @@ from physics3d.boundaries.base import AbstractBoundary
 from physics3d.boundaries.fixed_region import FixedRegion
 from physics3d.boundaries.held_particles import HeldParticles
 from physics3d.gaussians.embedding import Embedding
+from physics3d.matter import Matter
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,6 +22,7 @@ class Body(AbstractArtifact):
     spacing: float  # distance between neighbours [m]
     embedding: Embedding  # how the moving Gaussians ride on the particles
     attached: Bool[Tensor, " p"] | None = None  # beside something static, which holds them there; None: nothing is
+    matter: Matter | None = None  # of which pieces the particles stand for; None: cubes around them
     parts: tuple[str, ...] = ()  # names of the segmentation's parts; empty: they have none
 
     def held(self, boundaries: tuple[AbstractBoundary, ...]) -> tuple[AbstractBoundary, ...]:
@@ -51,5 +53,7 @@ class Body(AbstractArtifact):
             raise ValueError(
                 f"Body.volume: {int((self.volume <= 0).sum())} particles without volume; each must be > 0 m^3"
             )
+        if self.matter is not None:
+            self.matter.check()
         if not self.spacing > 0:
             raise ValueError(f"Body.spacing is {self.spacing:g} m, must be > 0")

@@ -9,9 +9,9 @@ from physics3d.gaussians.model import Gaussians
 from physics3d.learning.fields import GlobalField
 from physics3d.learning.loss import Chain
 from physics3d.log import Log
-from physics3d.mpm.rollout import rollout
 from physics3d.priors.base import AbstractPrior
 from physics3d.scenes.base import Capture, Take
+from physics3d.solver import motion_of
 from physics3d.world import World
 
 
@@ -27,6 +27,7 @@ def chain_of(
     *,
     image_scale: float,
     device: str,
+    log: Log,
 ) -> Chain:
     """Of the frames `indices`, evenly spaced, of the cameras of the take that are not held out.
 
@@ -46,19 +47,21 @@ def chain_of(
     background = torch.tensor(capture.background, dtype=torch.float32, device=device)
     backdrops = {i: Backdrop.of(model, embedding, cameras[i], background=background) for i in views}
 
+    part = lambda values: world.material.per_part(values, body.part, body.parts)
+    motion = motion_of(
+        world,
+        rest,
+        volume,
+        excitation=(*body.held(world.boundaries), *take.excitation),
+        part=part,
+        matter=body.matter,
+        device=device,
+        log=log,
+    )
+
     def simulate(theta: Tensor):
-        return rollout(
-            world,
-            world.material.per_part(field.parameters(theta), body.part, body.parts),
-            rest,
-            volume,
-            velocity=field.velocity(theta),
-            excitation=(*body.held(world.boundaries), *take.excitation),
-            frames=len(indices),
-            frame_dt=int(indices[1]) / take.fps,
-            device=device,
-            log=Log(None),
-        )
+        timing = dict(frames=len(indices), frame_dt=int(indices[1]) / take.fps, log=Log(None))
+        return motion(part(field.parameters(theta)), velocity=field.velocity(theta), **timing)
 
     def render(motion, view: int, frames: Tensor) -> Tensor:
         draw = lambda x, F: (

@@ -37,6 +37,10 @@ class NeoHookean(AbstractMaterial):
     def example(self) -> dict[str, float]:
         return {"youngs_modulus": 1e5, "poissons_ratio": 0.4}  # soft rubber
 
+    @property
+    def recovers(self) -> bool:
+        return True
+
     def check_parameters(self, values: Values) -> None:
         check_names(values, self.parameters)
         check_elastic(values)

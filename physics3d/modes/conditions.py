@@ -4,8 +4,7 @@
     the same for some time, EnforcedTranslation, EnforcedRotation
                                  from the start on: springs to the prescribed place, for as long as they act
     Impulse                      a force on the matter of the particles it selects
-    HalfSpace, BoundingBox, MeshCollider, MovingCuboid
-                                 nothing, as long as the body does not touch them; whether it does is looked at
+    HalfSpace, BoundingBox       nothing, as long as the body does not touch them; `touched` looks at that
 
 Everything else, and holds that begin later, need the grid: `Refused` says so.
 """
@@ -16,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -27,11 +27,10 @@ from physics3d.boundaries.fixed_region import FixedRegion
 from physics3d.boundaries.half_space import HalfSpace
 from physics3d.boundaries.held_particles import HeldParticles
 from physics3d.boundaries.impulse import Impulse
-from physics3d.boundaries.mesh_collider import MeshCollider
-from physics3d.boundaries.moving_cuboid import MovingCuboid
-from physics3d.modes.matter import Matter, Pins, outside_box, outside_particles
+from physics3d.matter import Matter
+from physics3d.modes.cuts import Pins, outside_box, outside_particles
 
-WALLS = (HalfSpace, BoundingBox, MeshCollider, MovingCuboid)
+WALLS = (HalfSpace, BoundingBox)
 
 
 class Refused(ValueError):
@@ -143,3 +142,21 @@ def conditions(boundaries: Sequence[AbstractBoundary], setting: Setting, matter:
     return Conditions(
         matter=matter, pins=tuple(pins), held=held, loads=tuple(loads), grips=tuple(grips), walls=tuple(walls)
     )
+
+
+def touched(
+    walls: Sequence[AbstractBoundary], position: Float[Tensor, "t p 3"], radius: Float[Tensor, " p"]
+) -> tuple[AbstractBoundary, int] | None:
+    """The first wall that particles at `position` [m], half the edge of a cube large, reach, and in which frame."""
+    first = None
+    for wall in walls:
+        if isinstance(wall, HalfSpace):
+            normal = position.new_tensor(wall.normal)
+            depth = (position - position.new_tensor(wall.point)) @ (normal / normal.norm()) - radius
+        else:
+            low, high = (position - position.new_tensor(wall.lower)), (position.new_tensor(wall.upper) - position)
+            depth = torch.minimum(low, high).amin(-1) - radius
+        frames = (depth < 0).any(1).nonzero()
+        if len(frames) and (first is None or int(frames[0]) < first[1]):
+            first = wall, int(frames[0])
+    return first

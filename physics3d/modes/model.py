@@ -18,10 +18,10 @@ from torch import Tensor
 from physics3d.boundaries.base import AbstractBoundary, Setting
 from physics3d.log import Log
 from physics3d.materials.base import Values
+from physics3d.matter import Matter, in_one_piece, of_particles, points
 from physics3d.modes import basis, cubature, lattice, vibration
 from physics3d.modes.conditions import Conditions, Refused, conditions
 from physics3d.modes.dynamics import Spring, System
-from physics3d.modes.matter import Matter, of_particles, points, in_one_piece
 from physics3d.modes.stress import Points
 from physics3d.world import World
 

@@ -26,11 +26,11 @@ from physics3d.boundaries.base import AbstractBoundary
 from physics3d.log import Log
 from physics3d.materials.base import Values
 from physics3d.materials.mixture import PART
+from physics3d.matter import Matter
 from physics3d.modes.dynamics import NotSolved, Step, System
-from physics3d.modes.matter import Matter
 from physics3d.modes.model import MODES, QUADRATURE, Model, model
 from physics3d.modes.vibration import Mode
-from physics3d.mpm.rollout import Trajectory
+from physics3d.trajectory import Trajectory
 from physics3d.world import World
 
 STEPS = 24  # in a period of the fastest mode that matters
