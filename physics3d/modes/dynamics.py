@@ -150,7 +150,12 @@ class System:
         inertia = lambda y: self.mass @ ((4 / dt**2 + 2 * c / dt) * (y - q) - (2 / dt) * v)
         residual = lambda y: inertia(y) + self.force(y, after) + self._held(y, t)[0] - load
         before = self.points.state() if keep is not None else None
-        x = self._solve(q + dt / 2 * v, residual, 4 / dt**2 + 2 * c / dt, after, t)
+        inertial = 4 / dt**2 + 2 * c / dt
+        try:
+            x = self._solve(q + dt / 2 * v, residual, inertial, after, t)
+        except NotSolved:  # going straight on may stretch what in truth turns
+            self._refresh(q, after, (inertial, self._held(q, t)[1]))
+            x = self._solve(q, residual, inertial, after, t)
         if keep is not None:
             keep.append(_Taken(step, after, x, before, self._matrix))
         self.points.keep()

@@ -169,7 +169,8 @@ def model(
     log.info(
         f"{len(matter.position)} pieces, {splines.count} splines {1e3 * splines.H:.3g} mm apart, {len(weight)} points"
     )
-    fields = [shapes]
+    swings = exact > 1e3 * shift  # no rigid motion
+    fields = [shapes[:, swings]]
     sources = [*load_fields] + ([first_moment] if any(world.gravity) else [])
     responses = _responses((K + _three(rest) + shift * M).tocsr(), sources)
     if responses.size:
@@ -182,7 +183,8 @@ def model(
         fields += [more, _responses((everything + shift * M).tocsr(), [*sources, *pulls])]
     scalars = basis.turned(np.concatenate(fields, 1), G, weight)
     if not held:
-        scalars = np.concatenate([splines.affine() / np.array([span, 1, 1, 1]), scalars], 1)
+        rigid = (splines.affine() - [0, *at.mean(0)]) * [span, 1, 1, 1] / np.sqrt(weight.sum())
+        scalars = np.concatenate([rigid, scalars], 1)
     C = basis.independent(scalars, N, G, weight, span)
     slopes_there, still = G @ C, np.zeros((len(weight), 3, 3))
     tangent = stuck.tangent(still, vibration.STUCK)
@@ -197,7 +199,7 @@ def model(
     K += np.kron(C.T @ (permanent @ C), np.eye(3))
     mass = C.T @ (scalar_mass @ C)
     lowest, shapes = vibration.dense_modes(K, np.kron(mass, np.eye(3)), len(exact), shift=shift)
-    off = np.abs(np.sqrt(np.maximum(lowest / exact, 0))[exact > 1e3 * shift][:4] - 1)
+    off = np.abs(np.sqrt(np.maximum(lowest / exact, 0))[swings][:4] - 1)
     log.info(
         f"basis of {C.shape[1]} fields, integrated at {len(which)} points: its first frequencies are within "
         f"{100 * off.max(initial=0):.2g} % of those of the splines"

@@ -113,6 +113,24 @@ class Solver:
         """The lowest modes of vibration about the undeformed state."""
         return self.model.modes(self.coefficients(parameters).detach().numpy())
 
+    def statics(
+        self, parameters: Values, load: AbstractBoundary | None = None, *, gravity: bool = False
+    ) -> Float[Tensor, "p 3"]:
+        """Displacement of the particles [m] in equilibrium, a long time after the force of `load`, one of the excitation,
+        and gravity have begun to act. Raises ValueError if there is none."""
+        body, loads = self.model, self._loads().detach().numpy()
+        total = np.zeros((body.count, 3))
+        if gravity:
+            total += loads[0]
+        if load is not None:
+            which = next(i for i, known in enumerate(body.conditions.loads) if known.boundary is load)
+            total += loads[1 + which]
+        system = body.system(self.coefficients(parameters).detach().numpy())
+        try:
+            return torch.from_numpy(body.values @ system.statics(np.zeros_like(total), total))
+        except NotSolved as reason:
+            raise ValueError(f"no equilibrium was found: {reason}; take a weaker force or a stiffer material") from None
+
     def rollout(
         self,
         parameters: Values,

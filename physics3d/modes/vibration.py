@@ -103,6 +103,7 @@ def dense_modes(
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "n m"]]:
     """As `modes`, of a few functions."""
     # the mass of some directions is next to nothing, so it is not the one that is factored
+    count = min(count, len(K))
     K = (K + K.T) / 2 + shift * M
     inverse, vectors = linalg.eigh(M, K + 1e-10 * np.diag(K).mean() * np.eye(len(K)), subset_by_index=(len(K) - count, len(K) - 1))
     inverse, vectors = inverse[::-1], vectors[:, ::-1]
