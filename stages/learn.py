@@ -112,6 +112,7 @@ class Learn:
             indices,
             image_scale=self.image_scale,
             device=self.device,
+            log=log,
         )
         log.info(
             f"learning {', '.join(field.names)} from take {take.name}: {len(indices)} frames over {seconds:.2f} s, "
