@@ -14,7 +14,7 @@ from physics3d.materials.viscoelastic import Viscoelastic
 from physics3d.scenes.base import AbstractSource, Capture
 from physics3d.scenes.photographs import held_out, triple
 from physics3d.scenes.studio import Light, Mesh, Studio, photographs, ring, surface_grid, to_linear
-from physics3d.scenes.synthetic import film, particles
+from physics3d.scenes.synthetic import check, film, particles
 from physics3d.world import World
 
 RADIUS = 0.05  # [m]
@@ -52,6 +52,7 @@ class BallTwin(AbstractSource):
         return ()
 
     def __call__(self, *, log) -> Capture:
+        check(self, counts=("views", "width", "height", "frames", "points"), positive=("fps", "push", "density", "dx"))
         centre = (0.0, 0.0, RADIUS + self.gap)
         mesh = checkered_ball(centre)
         light = Light(sun=(1.0, 0.96, 0.9), backdrop=(1.0, 1.0, 1.0))

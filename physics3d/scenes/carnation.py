@@ -21,7 +21,7 @@ from physics3d.scenes.base import AbstractSource, Capture
 from physics3d.scenes.flower import SOIL, blossom_centre, plant, surroundings
 from physics3d.scenes.photographs import held_out, triple
 from physics3d.scenes.studio import Light, Studio, photographs, ring
-from physics3d.scenes.synthetic import film, particles
+from physics3d.scenes.synthetic import check, film, particles
 from physics3d.world import World
 
 
@@ -56,6 +56,7 @@ class CarnationTwin(AbstractSource):
         return ()
 
     def __call__(self, *, log) -> Capture:
+        check(self, counts=("views", "width", "height", "frames", "points"), positive=("fps", "push", "density", "dx"))
         meshes, solids = plant(self.seed)
         light = Light(backdrop=(0.80, 0.83, 0.86))
         studio = Studio([*meshes, *surroundings(self.seed)], light, openness_rays=24, seed=self.seed)

@@ -23,6 +23,18 @@ from physics3d.scenes.studio import Mesh, Studio
 from physics3d.world import World
 
 
+def check(twin, *, counts: tuple[str, ...], positive: tuple[str, ...]) -> None:
+    """Raise ValueError naming the field: `counts` must be whole and at least 1 (frames 2), `positive` positive."""
+    for name in counts:
+        value, least = getattr(twin, name), 2 if name == "frames" else 1
+        if isinstance(value, bool) or not float(value).is_integer() or value < least:
+            raise ValueError(f"{name} of the twin is {value}; it must be a whole number, at least {least}")
+    for name in positive:
+        value = getattr(twin, name)
+        if not 0 < value < float("inf"):
+            raise ValueError(f"{name} of the twin is {value}; it must be positive")
+
+
 def film(
     *,
     role: str,
