@@ -128,27 +128,22 @@ def _parameters(kind: Declared, values: dict[str, Any], name: str) -> str | None
         return None
     ranges = parameter_ranges(values["material"])
     for parameter, value in values["start"].items():
-        if ranges and parameter not in ranges:
+        allowed = ranges.get(re.sub(r"_[23]$", "", parameter))  # of a further branch likewise
+        if allowed is None:
             return f"{name}.start.{parameter}: the material has no such parameter; {nearest(parameter, list(ranges))}"
-        text = complaint(ranges.get(parameter, float), value, f"{name}.start.{parameter}")
-        if text:
+        if text := complaint(allowed, value, f"{name}.start.{parameter}"):
             return text
     return None
 
 
 def parameter_ranges(material: dict[str, Any]) -> dict[str, Any]:
-    """Parameter -> what values it may take, of a material's configuration; those of its parts and branches included."""
+    """Parameter -> what values it may take, of a configured material, its solid and its parts."""
     found = dict(declared(material["_target_"]).ranges)
-    branches = int(material.get("branches", 1))
-    found |= {f"{k}_{i}": v for k, v in found.items() for i in range(2, branches + 1) if k.startswith(BRANCHED)}
     if isinstance(material.get("solid"), dict):
         found |= parameter_ranges(material["solid"])
     for part, of in material.get("materials", {}).items():
         found |= {f"{part}.{k}": v for k, v in parameter_ranges(of).items()}
     return found
-
-
-BRANCHED = ("branch_", "shear_", "bulk_viscosity")
 
 
 def _between(config: dict[str, Any]) -> Iterator[str]:

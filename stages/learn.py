@@ -55,7 +55,7 @@ class Learn:
     ] = ()  # groups that share one factor, e.g. [[youngs_modulus, branch_shear_modulus]]
     learn_velocity: bool = False  # one initial velocity for the whole body
     steps: Whole = 30  # of gradient descent
-    polish: Whole = 0  # Gauss-Newton steps after the descent; one costs a forward run per parameter and two
+    polish: Whole = 0  # Levenberg steps after the descent; one costs a forward run per parameter and two
     learning_rate: Annotated[float, Gt(0), Le(10)] = 0.1  # first step of theta: 0.1 is ten per cent of a parameter
     duration: Duration | None = None  # only the first part of the take is used [s]; None: all of it
     frames: Frames = 15  # of the take, spread over the duration
@@ -112,6 +112,7 @@ class Learn:
             indices,
             image_scale=self.image_scale,
             device=self.device,
+            log=log,
         )
         log.info(
             f"learning {', '.join(field.names)} from take {take.name}: {len(indices)} frames over {seconds:.2f} s, "

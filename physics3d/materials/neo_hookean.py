@@ -39,6 +39,10 @@ class NeoHookean(AbstractMaterial):
     def example(self) -> dict[str, float]:
         return {"youngs_modulus": 1e5, "poissons_ratio": 0.4}  # soft rubber
 
+    @property
+    def recovers(self) -> bool:
+        return True
+
     def coefficients(self, values: Values) -> Float[Tensor, "2 n"]:
         self.check_parameters(values)
         return rows(*lame(values["youngs_modulus"], values["poissons_ratio"]))

@@ -80,6 +80,10 @@ class Viscoelastic(AbstractMaterial):
         return ("", "_2", "_3")[: self.branches]
 
     @property
+    def recovers(self) -> bool:
+        return self.elastic
+
+    @property
     def memory_rows(self) -> int:
         return 6 * self.branches
 
