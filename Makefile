@@ -9,7 +9,7 @@ PYTHON ?= python3
 
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup run ui view test bench lint clean
+.PHONY: help setup run ui view test bench lint architecture clean
 py := .venv/bin/python
 # torch's own threads spin beside those of the renderer and the simulator: OMP_NUM_THREADS=1 unless you say otherwise
 ready := .venv/.ready
@@ -57,6 +57,9 @@ bench-%: $(ready)
 
 lint: $(ready) ## style and types
 	@$(py) -m ruff check . && $(py) -m ruff format --check . && $(py) -m mypy
+
+architecture: $(ready) ## draw docs/architecture.png and its table from the imports
+	@$(py) docs/draw_architecture.py
 
 clean: ## remove results and caches (artifacts, MLflow, Prefect); keeps .venv
 	@rm -rf artifacts mlartifacts mlflow.db .prefect .pytest_cache .ruff_cache .mypy_cache .hypothesis build *.egg-info

@@ -18,8 +18,9 @@ from pathlib import Path
 import torch
 from machine import machine
 
-from physics3d.gaussians.densify import Adaptive, Relocation
-from physics3d.gaussians.fit import held_out_psnr
+from physics3d.gaussians.densification.adaptive import Adaptive
+from physics3d.gaussians.densification.relocation import Relocation
+from physics3d.gaussians.loss import held_out_psnr
 from physics3d.log import Log
 from physics3d.scenes.base import Capture
 from pipeline.settings import compose
@@ -165,7 +166,7 @@ def page(final: list[dict], left_out: list[str], title: str) -> str:
         "",
         "PSNR [dB] of photographs that were held out, all at the largest resolution of their scene. The largest",
         "budget is the scene's configuration, the others are parts of it. `adaptive` splits what draws the most",
-        "error, `MCMC` moves faded Gaussians to where opaque ones are (`physics3d/gaussians/densify.py`). The last",
+        "error, `MCMC` moves faded Gaussians to where opaque ones are (`physics3d/gaussians/densification/`). The last",
         "column is the change of PSNR by the removal of floaters, which is part of every row that has one.",
         "",
         "![PSNR against time](reconstruction.png)",

@@ -49,7 +49,7 @@ from physics3d.materials.viscoelastic import Viscoelastic
 from physics3d.materials.von_mises import VonMises
 from physics3d.materials.with_branches import WithBranches
 from physics3d.mpm.rollout import rollout
-from physics3d.mpm.transfer import velocity_gradient
+from physics3d.mpm.velocity_gradient import velocity_gradient
 from physics3d.world import World
 
 RESULTS = Path(__file__).resolve().parent.parent / "docs" / "results"

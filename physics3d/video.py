@@ -30,11 +30,6 @@ class Video(AbstractArtifact):
             raise ValueError(f"Video.fps is {self.fps}; it must be positive")
 
 
-def to_uint8(image: Tensor) -> Tensor:
-    """Float colour in 0..1 -> uint8, rounding to nearest."""
-    return (image.detach().clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu()
-
-
 def ffmpeg() -> str:
     """Path of the ffmpeg program. Raises RuntimeError with the remedy if there is none."""
     try:
@@ -76,22 +71,3 @@ def read_mp4(path: Path) -> tuple[UInt8[Tensor, "t h w 3"], float]:
     except Exception as error:
         raise ValueError(f"cannot read the video {path}: {error}") from error
     return torch.from_numpy(frames), fps
-
-
-def contact_sheet(frames: UInt8[Tensor, "t h w 3"], *, columns: int = 6, count: int = 12) -> UInt8[Tensor, "H W 3"]:
-    """`count` frames evenly spaced in time, laid out in a grid: a video one can look at as a picture."""
-    count = min(count, len(frames))
-    columns = min(columns, count)
-    picks = frames[torch.linspace(0, len(frames) - 1, count).round().long()]
-    rows = -(-count // columns)
-    t, h, w, _ = picks.shape
-    sheet = torch.full((rows * columns, h, w, 3), 255, dtype=torch.uint8)
-    sheet[:t] = picks
-    return sheet.reshape(rows, columns, h, w, 3).permute(0, 2, 1, 3, 4).reshape(rows * h, columns * w, 3)
-
-
-def space_time_slice(frames: UInt8[Tensor, "t h w 3"], *, row: int | None = None, column: int | None = None) -> Tensor:
-    """One line of pixels over time: uint8 [h, t, 3] for a column, [t, w, 3] for a row. Shows motion as a curve."""
-    if (row is None) == (column is None):
-        raise ValueError("space_time_slice needs exactly one of row and column")
-    return frames[:, row] if row is not None else frames[:, :, column].transpose(0, 1)

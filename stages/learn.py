@@ -8,16 +8,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from physics3d.filling.fill import Body
-from physics3d.gaussians.deform import Backdrop, render_deformed
+from physics3d.filling.body import Body
 from physics3d.gaussians.model import Gaussians
-from physics3d.learning.fields import GlobalField
-from physics3d.learning.fit import Chain, fit, physical, polish, search, sensitivity
+from physics3d.learning.chain import chain_of
+from physics3d.learning.curves import curves
+from physics3d.learning.fields import GlobalField, physical
+from physics3d.learning.fit import fit
+from physics3d.learning.linear import sensitivity
+from physics3d.learning.loss import Chain
+from physics3d.learning.polish import polish
+from physics3d.learning.search import search
 from physics3d.log import Log
-from physics3d.mpm.rollout import rollout
+from physics3d.pictures import contact_sheet, to_uint8
 from physics3d.priors.base import AbstractPrior
 from physics3d.scenes.base import Capture, Take
-from physics3d.video import contact_sheet, to_uint8
 from physics3d.world import Estimate, World
 
 
@@ -79,7 +83,18 @@ class Learn:
             start_velocity=start.velocity,
             velocity_scale=self.natural_speed(body, seconds) if self.learn_velocity else None,
         )
-        chain = self.chain(capture, gaussians, body, take, field, indices)
+        chain = chain_of(
+            self.world,
+            self.prior,
+            field,
+            capture,
+            gaussians,
+            body,
+            take,
+            indices,
+            image_scale=self.image_scale,
+            device=self.device,
+        )
         log.info(
             f"learning {', '.join(field.names)} from take {take.name}: {len(indices)} frames over {seconds:.2f} s, "
             f"{len(chain.clips)} camera(s), {len(body.position)} particles"
@@ -140,48 +155,6 @@ class Learn:
         size = body.position.amax(0) - body.position.amin(0)
         return float(size.norm()) / seconds
 
-    def chain(
-        self, capture: Capture, gaussians: Gaussians, body: Body, take: Take, field: GlobalField, indices: Tensor
-    ) -> Chain:
-        """What `fit` needs: how theta becomes a motion, a motion a clip, and the clips to compare with."""
-        views = [i for i in range(len(take.cameras)) if i not in take.held_out_cameras]
-        if not views:
-            raise ValueError(f"take {take.name}: all cameras are held out; leave one to learn from")
-        cameras = {i: take.cameras[i].scaled(self.image_scale) for i in views}
-        clips = {}
-        for i in views:
-            video = take.videos[i][indices].permute(0, 3, 1, 2).to(self.device, torch.float32) / 255
-            size = (cameras[i].height, cameras[i].width)
-            clips[i] = torch.nn.functional.interpolate(video, size, mode="area").permute(0, 2, 3, 1)
-        model, embedding = gaussians.to(self.device), body.embedding
-        rest, volume = body.position.to(self.device), body.volume.to(self.device)
-        background = torch.tensor(capture.background, dtype=torch.float32, device=self.device)
-        backdrops = {i: Backdrop.of(model, embedding, cameras[i], background=background) for i in views}
-
-        def simulate(theta: Tensor):
-            return rollout(
-                self.world,
-                self.world.material.per_part(field.parameters(theta), body.part, body.parts),
-                rest,
-                volume,
-                velocity=field.velocity(theta),
-                excitation=(*body.held(self.world.boundaries), *take.excitation),
-                frames=len(indices),
-                frame_dt=int(indices[1]) / take.fps,
-                device=self.device,
-                log=Log(None),
-            )
-
-        def render(motion, view: int, frames: Tensor) -> Tensor:
-            draw = lambda x, F: (
-                render_deformed(
-                    model, embedding, rest, x, F, cameras[view], background=background, backdrop=backdrops[view]
-                ).color
-            )
-            return torch.stack([draw(motion.position[i], motion.deformation[i]) for i in frames.tolist()]).float()
-
-        return Chain(simulate=simulate, render=render, clips=clips, prior=self.prior)
-
     def searched(self, chain: Chain, field: GlobalField, log: Log) -> Tensor:
         directions = torch.tensor([float(name.split("+")[0].endswith("modulus")) for name in field.names]).double()
         if not directions.any():
@@ -218,21 +191,3 @@ class Learn:
                     f"{part}: {before[part]:.4g} -> {after[part]:.4g}{truth}; a factor e changes the picture by "
                     f"{rms:.2g} of 255, standard error at least {error:.2g} of a factor e"
                 )
-
-
-def curves(capture: Capture, history: dict[str, list[float]]):
-    """A figure: every parameter against the step, the truth dashed where it is known, and the loss."""
-    from matplotlib.figure import Figure
-
-    names = [name for name in history if name != "gradient"]
-    figure = Figure(figsize=(3.2 * max(1, len(names)), 2.8), layout="constrained")
-    for i, name in enumerate(names):
-        axis = figure.add_subplot(1, len(names), i + 1)
-        axis.plot(history[name], lw=1.5)
-        if name in capture.truth:
-            axis.axhline(capture.truth[name], ls="--", color="0.4", label="truth")
-            axis.legend(frameon=False)
-        if max(history[name]) > 5 * min(history[name]) > 0:
-            axis.set_yscale("log")
-        axis.set(title=name, xlabel="step")
-    return figure

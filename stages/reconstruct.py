@@ -4,12 +4,17 @@ from dataclasses import dataclass, field
 
 import torch
 
-from physics3d.gaussians.densify import AbstractDensification, Adaptive
-from physics3d.gaussians.fit import Photograph, Rates, background_points, fit, from_points, held_out_psnr, random_points
+from physics3d.gaussians.adam import Rates
+from physics3d.gaussians.densification.adaptive import Adaptive
+from physics3d.gaussians.densification.base import AbstractDensification
+from physics3d.gaussians.fit import fit
 from physics3d.gaussians.floaters import floaters
+from physics3d.gaussians.loss import held_out_psnr
 from physics3d.gaussians.model import Gaussians
+from physics3d.gaussians.photograph import Photograph
 from physics3d.gaussians.ply import write_ply
 from physics3d.gaussians.render import render
+from physics3d.gaussians.start import background_points, from_points, random_points
 from physics3d.log import Log
 from physics3d.scenes.base import Capture
 

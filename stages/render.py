@@ -5,15 +5,16 @@ from dataclasses import dataclass
 
 import torch
 
-from physics3d.filling.fill import Body
+from physics3d.filling.body import Body
 from physics3d.gaussians.cameras import Camera
 from physics3d.gaussians.deform import Backdrop, render_deformed
 from physics3d.gaussians.interior import Interior, paint
 from physics3d.gaussians.model import Gaussians
 from physics3d.log import Log
-from physics3d.mpm.rollout import Trajectory
+from physics3d.pictures import contact_sheet, space_time_slice, to_uint8
 from physics3d.scenes.base import Capture
-from physics3d.video import Video, contact_sheet, space_time_slice, to_uint8, write_mp4
+from physics3d.trajectory import Trajectory
+from physics3d.video import Video, write_mp4
 
 
 @dataclass(frozen=True, kw_only=True)

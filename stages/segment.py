@@ -8,23 +8,21 @@ import torch
 from physics3d.gaussians.model import Gaussians
 from physics3d.gaussians.render import render
 from physics3d.log import Log
+from physics3d.pictures import tiled
 from physics3d.scenes.base import Capture
 from physics3d.segmentation import Segmentation
-from physics3d.segmentation.lift import contributions, islands, lift, one_hot, shares, touching
-from physics3d.segmentation.masks import AbstractMasker, GrabCut
-from physics3d.segmentation.previews import contact_sheet, tinted
-from physics3d.segmentation.prompts import (
-    Prompt,
-    Room,
-    View,
-    carry_masks,
-    mask_of_box,
-    numbered,
-    prompted_mask,
-    refined_masks,
-    told_apart,
-    within_any,
-)
+from physics3d.segmentation.belief import one_hot, shares
+from physics3d.segmentation.carry_masks import carry_masks, refined_masks
+from physics3d.segmentation.claims import numbered, told_apart
+from physics3d.segmentation.lift import contributions, lift
+from physics3d.segmentation.maskers.base import AbstractMasker
+from physics3d.segmentation.maskers.grabcut import GrabCut
+from physics3d.segmentation.neighbours import beside_static, islands
+from physics3d.segmentation.previews import tinted
+from physics3d.segmentation.prompted import mask_of_box, prompted_mask
+from physics3d.segmentation.prompts import Prompt, within_any
+from physics3d.segmentation.rooms import Room
+from physics3d.segmentation.views import View, spread_out, view_of
 
 LEAST_PIXELS = 20  # a mask smaller than this is no mask
 
@@ -55,7 +53,7 @@ class Segment:
             for _ in range(self.rounds if self.prompts else 0):
                 views, maps = every, self._refine(gaussians, label, every, parts, rooms, capture, log)
                 label = self._lift(gaussians, views, maps, parts, rooms)
-            log.image("masks", contact_sheet([tinted(v.image, m.numpy()) for v, m in zip(views, maps)]))
+            log.image("masks", tiled([tinted(v.image, m.numpy()) for v, m in zip(views, maps)]))
             gaussians = gaussians.to("cpu")
         else:
             views, maps = [], []
@@ -64,7 +62,7 @@ class Segment:
 
         apart = islands(gaussians.mean, gaussians.opacity, label)
         label[apart] = 0
-        touch = touching(gaussians.mean, gaussians.opacity, label)
+        touch = beside_static(gaussians.mean, gaussians.opacity, label)
         for k, part in enumerate(parts, 1):
             count = int((label == k).sum())
             log.info(f"{part}: {count} of {len(label)} Gaussians")
@@ -102,7 +100,7 @@ class Segment:
         said: dict[str, tuple[View, np.ndarray]] = {}
         in_image = [(p, _index(capture, p.view)) for p in self.prompts if p.in_image]
         for index in dict.fromkeys(index for _, index in in_image):
-            view, here = self._view(capture, gaussians, index), [p for p, i in in_image if i == index]
+            view, here = view_of(capture, gaussians, index, self.size), [p for p, i in in_image if i == index]
             masks = {}
             for part in dict.fromkeys(p.part for p in here):
                 if part in said:
@@ -189,29 +187,8 @@ class Segment:
         candidates = whole if len(whole) >= min(self.views, 4) else training
         if len(candidates) < len(training):
             log.info(f"{len(candidates)} of {len(training)} photographs show the whole object")
-        centres = torch.stack([capture.cameras[i].centre for i in candidates])
-        chosen = first or [candidates[0]]
-        distance = torch.full((len(candidates),), torch.inf, dtype=torch.float64)
-        for i in chosen:
-            distance = torch.minimum(distance, (centres - capture.cameras[i].centre).norm(dim=1))
-        while len(chosen) < min(self.views, len(candidates)):
-            k = int(distance.argmax())
-            chosen.append(candidates[k])
-            distance = torch.minimum(distance, (centres - centres[k]).norm(dim=1))
-            distance[k] = -1
-        return [self._view(capture, gaussians, i) for i in log.progress(chosen, "rendering depth")]
-
-    def _view(self, capture: Capture, gaussians: Gaussians, index: int) -> View:
-        import cv2
-
-        image, camera = capture.images[index].numpy(), capture.cameras[index]
-        if max(image.shape) > self.size:
-            camera = camera.scaled(self.size / max(image.shape))
-            image = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-        with torch.no_grad():
-            rendered = render(gaussians, camera, background=capture.background)
-        rendered = type(rendered)(color=rendered.color.cpu(), alpha=rendered.alpha.cpu(), depth=rendered.depth.cpu())
-        return View(index, capture.names[index], image, camera, rendered)
+        chosen = spread_out(capture.cameras, candidates, first, self.views)
+        return [view_of(capture, gaussians, i, self.size) for i in log.progress(chosen, "rendering depth")]
 
     def _boxes(self, part: str) -> tuple[Prompt, ...]:
         return tuple(p for p in self.prompts if p.part == part and p.lower is not None)
@@ -243,7 +220,7 @@ class Segment:
                 with torch.no_grad():
                     color = render(gaussians.select(chosen), camera, background=(1.0, 1.0, 1.0)).color
                 pictures.append((color.clamp(0, 1) * 255).round().to(torch.uint8).numpy())
-            log.image(name, contact_sheet(pictures))
+            log.image(name, tiled(pictures))
 
 
 def _index(capture: Capture, view: str | int) -> int:

@@ -8,9 +8,10 @@ import torch
 
 from physics3d.boundaries.base import AbstractBoundary
 from physics3d.boundaries.impulse import Impulse
-from physics3d.filling.fill import Body
+from physics3d.filling.body import Body
 from physics3d.log import Log
-from physics3d.mpm.rollout import Trajectory, rollout
+from physics3d.mpm.rollout import rollout
+from physics3d.trajectory import Trajectory
 from physics3d.world import Estimate, World
 
 

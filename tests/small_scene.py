@@ -4,9 +4,9 @@ import torch
 
 from physics3d.boundaries.fixed_region import FixedRegion
 from physics3d.boundaries.impulse import Impulse
-from physics3d.filling.fill import Body
+from physics3d.filling.body import Body
 from physics3d.gaussians.cameras import Camera, look_at
-from physics3d.gaussians.deform import embed
+from physics3d.gaussians.embedding import embed
 from physics3d.gaussians.model import Gaussians
 from physics3d.learning.fields import GlobalField
 from physics3d.materials.viscoelastic import Viscoelastic

@@ -33,8 +33,9 @@ from torch import Tensor
 from physics3d.artifact import require_finite
 from physics3d.gaussians.cameras import Camera
 from physics3d.gaussians.model import Gaussians
-from physics3d.gaussians.splatting import ENTRIES, Kernels, Numerics, kernels
-from physics3d.gaussians.splatting import NEAR as NEAR
+from physics3d.gaussians.splat import ENTRIES, Numerics
+from physics3d.gaussians.splat import NEAR as NEAR
+from physics3d.gaussians.splatting import Kernels, kernels
 
 STANDARD = Numerics()
 Tiles = tuple[int, int, int, int]  # first row of tiles, one past the last; first column, one past the last

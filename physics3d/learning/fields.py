@@ -106,3 +106,12 @@ def poissons_ratio(start: Tensor, offset: Tensor) -> Tensor:
     """Poisson's ratio whose K/mu is exp(offset) times that of `start`."""
     ratio = 2 * (1 + start) / (3 * (1 - 2 * start)) * offset.exp()
     return (3 * ratio - 2) / (2 * (3 * ratio + 1))
+
+
+def physical(field: GlobalField, theta: Tensor) -> dict[str, float]:
+    """The learned parameters in SI units."""
+    values = field.parameters(theta)
+    learned = {name: float(values[name].mean()) for group in field.groups for name in group}
+    if field.velocity_scale is not None:
+        learned |= dict(zip(("velocity_x", "velocity_y", "velocity_z"), field.velocity(theta).tolist()))
+    return learned

@@ -7,7 +7,9 @@ import pytest
 import torch
 
 from physics3d.gaussians.cameras import Camera, look_at
-from physics3d.gaussians.deform import Backdrop, Embedding, _Rotation, carry, embed, render_deformed
+from physics3d.gaussians.carry import _Rotation, carry
+from physics3d.gaussians.deform import Backdrop, render_deformed
+from physics3d.gaussians.embedding import Embedding, embed
 from physics3d.gaussians.model import Gaussians
 from physics3d.gaussians.render import render
 

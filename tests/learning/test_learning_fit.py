@@ -4,12 +4,16 @@ import pytest
 import torch
 from small_scene import DAMPED, bar, cameras, capture, learner
 
-from physics3d.gaussians.deform import carry
+from physics3d.gaussians.carry import carry
 from physics3d.gaussians.sh import sh_color
-from physics3d.gaussians.splatting import Numerics
+from physics3d.gaussians.splat import Numerics
 from physics3d.gaussians.twin import rasterize_plainly
 from physics3d.learning.fields import GlobalField
-from physics3d.learning.fit import Chain, draw_frames, fit, linearise, polish, search, sensitivity
+from physics3d.learning.fit import fit, some_frames
+from physics3d.learning.linear import linearise, sensitivity
+from physics3d.learning.loss import Chain
+from physics3d.learning.polish import polish
+from physics3d.learning.search import search
 from physics3d.log import Log
 from physics3d.priors.exemplar import Exemplar
 
@@ -209,6 +213,6 @@ def test_sensitivity_tells_the_seen_from_the_unseen():
 def test_drawn_frames_span_the_whole_clip():
     chain, generator = toy()[0], torch.Generator().manual_seed(0)
     for _ in range(50):
-        frames = draw_frames(chain, 3, generator).tolist()
+        frames = some_frames(chain, 3, generator).tolist()
         assert frames == sorted(set(frames)) and 1 <= frames[0] <= 3 and 5 <= frames[-1] <= 7
-    assert draw_frames(chain, 0, generator).tolist() == list(range(8))
+    assert some_frames(chain, 0, generator).tolist() == list(range(8))

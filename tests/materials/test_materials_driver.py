@@ -1,4 +1,4 @@
-"""Known answers on the test machine without a grid (docs/method.md, section 5, 1 to 5; yield, friction, viscosity)."""
+"""Known answers of the driver without a grid: docs/method.md, section 9, 1 to 5; yield, friction, viscosity."""
 
 import math
 

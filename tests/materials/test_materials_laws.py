@@ -247,7 +247,7 @@ def test_float32_follows_float64_in_a_stiff_body(material, rng):
             H, tau, memory = advance(material, 1e-6, (A / 1e-6).to(dtype), H, c, memory)
         stress[dtype] = tau.double()
     error = (stress[torch.float32] - stress[torch.float64]).abs().max() / stress[torch.float64].abs().max()
-    assert error < 0.01  # the target of docs/method.md; with b formed from 1 + H it is 0.05, with F stored 1
+    assert error < 0.01  # as docs/method.md says, section 2; with b formed from 1 + H it is 0.05, with F stored 1
 
 
 def test_parameters_out_of_range_are_named(material):

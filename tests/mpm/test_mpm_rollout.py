@@ -305,7 +305,7 @@ def test_snow_packed_within_a_frame_does_not_burst():
 
 def test_room_of_the_grid_does_not_grow_with_the_speed(monkeypatch):
     """Under 1e6 m/s^2 the first, far too long substeps are rejected on a small grid, not tried on a huge one."""
-    monkeypatch.setattr("physics3d.mpm.rollout.MOST_NODES", 100**3)
+    monkeypatch.setattr("physics3d.mpm.window.MOST_NODES", 100**3)
     position, volume = block((2, 2, 2), 0.1)
     world = soft_world(gravity=(0.0, 0.0, -1e6))
     trajectory = simulate(world, position, volume, frames=2, frame_dt=1e-3)

@@ -6,7 +6,7 @@ import torch
 import warp as wp
 
 from physics3d.mpm import transfer
-from physics3d.mpm.transfer import velocity_gradient
+from physics3d.mpm.velocity_gradient import velocity_gradient
 from physics3d.warp_types import matrix, vector, vector4
 
 DX, DT, SIDE, N = 0.1, 1e-3, 9, 40

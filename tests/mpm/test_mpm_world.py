@@ -11,7 +11,8 @@ from mpm_bodies import block, soft_world, tensors
 from physics3d.boundaries.impulse import Impulse
 from physics3d.log import Log
 from physics3d.materials.newtonian import Newtonian
-from physics3d.mpm.rollout import Trajectory, rollout
+from physics3d.mpm.rollout import rollout
+from physics3d.trajectory import Trajectory
 from physics3d.world import Estimate
 
 POSITION, VOLUME = block((2, 2, 2), 0.1)

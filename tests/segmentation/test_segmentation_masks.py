@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from physics3d.segmentation.masks import GrabCut, Sam2, Sam2Video, build_sam2
+from physics3d.segmentation.maskers.grabcut import GrabCut
+from physics3d.segmentation.maskers.sam2 import Sam2, Sam2Video, build_sam2
 
 NOTHING = np.zeros((0, 2))
 

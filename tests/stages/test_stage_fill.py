@@ -7,7 +7,7 @@ import pytest
 import torch
 from analytic_bodies import discs, joined, sphere
 
-from physics3d.filling.fill import Body
+from physics3d.filling.body import Body
 from physics3d.log import Log
 from physics3d.scenes.base import Capture
 from physics3d.segmentation import Segmentation

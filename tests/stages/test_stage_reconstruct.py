@@ -7,15 +7,16 @@ from dataclasses import replace
 import pytest
 import torch
 
+from physics3d.gaussians.adam import Rates
 from physics3d.gaussians.cameras import Camera, look_at
-from physics3d.gaussians.densify import Adaptive, Relocation
-from physics3d.gaussians.fit import Rates
+from physics3d.gaussians.densification.adaptive import Adaptive
+from physics3d.gaussians.densification.relocation import Relocation
 from physics3d.gaussians.model import FIELDS, Gaussians
 from physics3d.gaussians.ply import read_ply
 from physics3d.gaussians.render import render
 from physics3d.log import Log
+from physics3d.pictures import to_uint8
 from physics3d.scenes.base import Capture
-from physics3d.video import to_uint8
 from stages.reconstruct import Reconstruct
 
 QUICK = Reconstruct(

@@ -8,11 +8,11 @@ import torch
 
 from physics3d.boundaries.half_space import HalfSpace
 from physics3d.boundaries.impulse import Impulse
-from physics3d.filling.fill import Body
-from physics3d.gaussians.deform import embed
+from physics3d.filling.body import Body
+from physics3d.gaussians.embedding import embed
 from physics3d.log import METRICS, Log
 from physics3d.materials.neo_hookean import NeoHookean
-from physics3d.mpm.rollout import Trajectory
+from physics3d.trajectory import Trajectory
 from physics3d.world import World
 from stages.simulate import Simulate
 

@@ -1,14 +1,11 @@
-"""Where Gaussians are added while they are fitted, and which are removed; two ways, chosen by configuration.
+"""Faded Gaussians move to where others are, chosen with probability ~ opacity: a Markov chain Monte Carlo.
 
-`Adaptive`, after Rota Bulo et al. (2024): transparent Gaussians are removed, and those that draw the most error are
-split in two along their longest axis; e_i = sum over pixels of (blending weight x absolute error).
-
-`Relocation`, after Kheradmand et al. (2024), "3DGS as Markov chain Monte Carlo": faded Gaussians move to where others
-are, chosen with probability ~ opacity; the N Gaussians that then lie on top of each other draw what one drew, because
+The N Gaussians that then lie on top of each other draw what one drew, because
 
     o' = 1 - (1 - o)^(1/N),     scale' = scale o / sum_{i=1..N} sum_{k<i} C(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1)
 
 and between these moves every faint Gaussian takes random steps of covariance ~ Sigma^2, which explore.
+Kheradmand et al. (2024), "3D Gaussian splatting as Markov chain Monte Carlo".
 """
 
 import math
@@ -19,70 +16,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from physics3d.gaussians.adam import Moments
+from physics3d.gaussians.densification.base import AbstractDensification, require_some
 from physics3d.gaussians.model import Gaussians
 
-Moments = dict[str, tuple[Tensor, Tensor]]  # of Adam, per field of Gaussians; they follow splits and removals
 MOST_COPIES = 50  # N above which the scale is not corrected any further
-
-
-class AbstractDensification:
-    """A frozen dataclass with `every`: iterations between two calls of `renewed`."""
-
-    every: int
-
-    def renewed(
-        self, model: Gaussians, moments: Moments, error: Callable[[], Tensor], wanted: int, generator: torch.Generator
-    ) -> Gaussians:
-        """The model with up to `wanted` Gaussians, `moments` changed to match; `error` gives e_i [n], at some cost.
-
-        Raises ValueError if every Gaussian has faded.
-        """
-        raise NotImplementedError
-
-    def penalty(self, model: Gaussians, extent: float) -> Float[Tensor, ""]:
-        """What is added to the loss, so that Gaussians that do not help fade; `extent` [m] of the cameras."""
-        raise NotImplementedError
-
-    def stirred(self, model: Gaussians, step: float, generator: torch.Generator) -> Gaussians:
-        """Called after each step of descent; `step` is the step of positions over the extent of the scene [1/m]."""
-        raise NotImplementedError
-
-
-@dataclass(frozen=True, kw_only=True)
-class Adaptive(AbstractDensification):
-    every: int = 100
-    faded: float = 0.02  # opacity below which a Gaussian is removed
-    opacity_weight: float = 0.01  # of the mean opacity, in the loss
-
-    def penalty(self, model: Gaussians, extent: float) -> Float[Tensor, ""]:
-        return self.opacity_weight * model.opacity.mean()
-
-    def stirred(self, model: Gaussians, step: float, generator: torch.Generator) -> Gaussians:
-        return model
-
-    def renewed(
-        self, model: Gaussians, moments: Moments, error: Callable[[], Tensor], wanted: int, generator: torch.Generator
-    ) -> Gaussians:
-        with torch.no_grad():
-            keep = torch.nonzero(model.opacity > self.faded)[:, 0]
-            _require_some(keep)
-            count = max(0, min(wanted - len(keep), len(keep)))
-            split = torch.zeros(len(model), dtype=torch.bool, device=keep.device)
-            if count:
-                split[keep[torch.topk(error()[keep], count).indices]] = True
-            model, parents = model.select(torch.cat([keep, torch.nonzero(split)[:, 0]])), split[keep]
-            twin = torch.cat([parents, torch.ones(count, dtype=torch.bool, device=keep.device)])
-            side = torch.ones(len(model), device=keep.device)
-            side[len(keep) :] = -1
-            # two halves of the longest axis: centres 0.5 sigma from the middle, 0.6 times as long, 0.85 as thick
-            longest = torch.nn.functional.one_hot(model.log_scale.argmax(-1), 3).to(model.mean)
-            axis = torch.einsum("nij,nj->ni", model.rotation(), longest * torch.exp(model.log_scale))
-            thinner = math.log(0.85) + (math.log(0.6) - math.log(0.85)) * longest
-            mean = torch.where(twin[:, None], model.mean + 0.5 * side[:, None] * axis, model.mean)
-            log_scale = torch.where(twin[:, None], model.log_scale + thinner, model.log_scale)
-            for name, pair in moments.items():
-                moments[name] = tuple(torch.cat([a[keep], torch.zeros_like(a[:count])]) for a in pair)  # type: ignore[assignment]
-        return replace(model, mean=mean, log_scale=log_scale)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,7 +50,7 @@ class Relocation(AbstractDensification):
         with torch.no_grad():
             opacity, n = model.opacity, len(model)
             dead, alive = torch.nonzero(opacity <= self.faded)[:, 0], torch.nonzero(opacity > self.faded)[:, 0]
-            _require_some(alive)
+            require_some(alive)
             count = len(dead) + max(0, min(wanted - n, n))
             if not count:
                 return model
@@ -150,8 +88,3 @@ def shared(opacity: Float[Tensor, " n"], copies: Tensor) -> tuple[Float[Tensor, 
 def _beside(mask: Tensor, a: Tensor) -> Tensor:
     """`mask` [n] with as many dimensions as `a`."""
     return mask.reshape(-1, *[1] * (a.ndim - 1))
-
-
-def _require_some(alive: Tensor) -> None:
-    if len(alive) == 0:
-        raise ValueError("every Gaussian faded away; check the photographs' cameras, or give the capture points")
