@@ -97,20 +97,23 @@ class _Samples:
         method within a bracket, for all samples at once. Raises RuntimeError where there is none."""
         H, coefficients, memory = self.H.detach(), self.coefficients.detach(), self.memory.detach()
         scale = self.material.wave_modulus(coefficients).expand(self.count)
-        tolerance = (1e-12 if guess.dtype == torch.float64 else 3e-7) * scale
+        rounding, loose = torch.finfo(guess.dtype).eps, 1e-12 if guess.dtype == torch.float64 else 3e-7
         # the traction rises in between
         lower, upper, m = torch.full_like(guess, -0.9), torch.full_like(guess, 2.0), guess.detach()
-        for _ in range(100):
+        for tried in range(100):
             with torch.enable_grad():
                 m = m.requires_grad_()
                 side = self._trial(dt, _diagonal(axial, m), H, coefficients, memory)[1][:, 1, 1]
                 slope = torch.autograd.grad(side.sum(), m)[0]
             m, side = m.detach(), side.detach()
-            open_ = (side.abs() > tolerance) | (slope <= 0)
+            newton = m - side / slope
+            # as near as increments of strain are known, or as rounding of the parts of the stress lets it come
+            near = (newton - m).abs() <= rounding * torch.maximum(m.abs(), axial.abs())
+            near |= side.abs() <= (loose if tried >= 12 else 1e-12) * scale
+            open_ = ~(near & (slope > 0))
             if not bool(open_.any()):
                 return m, slope
             lower, upper = torch.where(side < 0, m, lower), torch.where(side < 0, upper, m)
-            newton = m - side / slope
             inside = (slope > 0) & (newton > lower) & (newton < upper)
             m = torch.where(open_, torch.where(inside, newton, (lower + upper) / 2), m)
         worst = int((side.abs() / scale).argmax())

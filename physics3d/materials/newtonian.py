@@ -76,7 +76,7 @@ class Newtonian(AbstractMaterial):
 @functools.cache
 def _advance(real: type) -> wp.Function:
     mat33 = matrix(real)
-    volume_change = volume.volume_change(real)
+    carried_volume = volume.carried_volume(real)
     least2 = real(_LEAST_RATE**2)
 
     cofactor, least_det = volume.cofactor(real), real(1e-12)
@@ -103,7 +103,7 @@ def _advance(real: type) -> wp.Function:
     ):
         one = wp.identity(n=3, dtype=real)
         M = dt * L
-        j = memory[0, p] + (real(1.0) + memory[0, p]) * volume_change(M)
+        j = carried_volume(memory[0, p], M)
         memory_next[0, p] = j
         J = real(1.0) + j
         D = rate(dt, L, M)

@@ -2,7 +2,7 @@
 
     tau   = tau_E + sum_N tau_N                                                     [Pa], Kirchhoff
     psi_E = mu sum_i (s_i - 1)^2 + lam/2 (J - 1)^2                                  fixed corotated, F = V R
-    tau_E = 2 mu (V^2 - V) + lam J (J - 1) I
+    tau_E = 2 mu (V^2 - V) + lam J (J - 1) I                                        J integrated by itself
     tau_N = 2 mu_N eps + lam_N tr(eps) I,   eps = 1/2 ln b_N                        Hencky spring
     d(dev eps)/dt = -k_d dev eps,   d(tr eps)/dt = -k_v tr eps                      dash-pot, [1/s]
 
@@ -89,7 +89,7 @@ class Viscoelastic(AbstractMaterial):
 
     @property
     def memory_rows(self) -> int:
-        return 7 * self.branches
+        return self._first_memory + 7 * self.branches
 
     def check_parameters(self, values: Values) -> None:
         check_names(values, self.parameters)
@@ -122,19 +122,23 @@ class Viscoelastic(AbstractMaterial):
         """Row of the first coefficient of a branch."""
         return (2 if self.elastic else 0) + 4 * branch
 
+    @property
+    def _first_memory(self) -> int:
+        """Row of the first branch: before it stands J - 1 of the elastic one."""
+        return 1 if self.elastic else 0
+
     def energy(
         self, coefficients: Float[Tensor, "k n"], H: Float[Tensor, "n 3 3"], memory: Float[Tensor, "m n"]
     ) -> Float[Tensor, " n"]:
-        one = torch.eye(3, dtype=H.dtype, device=H.device)
         psi = torch.zeros_like(H[:, 0, 0])
         if self.elastic:
             mu, lam = coefficients[:2]
-            J = volume.determinant(one + H)
-            psi = psi + mu * polar.stretch_distance(H) + lam / 2 * (J - 1) ** 2
+            psi = psi + mu * polar.stretch_distance(H) + lam / 2 * memory[0] ** 2
         for i in range(self.branches):
             mu, K = coefficients[self._first(i) : self._first(i) + 2]
             k_d, k_v = coefficients[self._first(i) + 2 : self._first(i) + 4]
-            strain, ahead = memory[7 * i : 7 * i + 6], memory[7 * i + 6]
+            row = self._first_memory + 7 * i
+            strain, ahead = memory[row : row + 6], memory[row + 6]
             dev, log_J = principal_log_strain(strain)
             # at the end of the step: what is ahead has relaxed by g already
             dev, log_J = dev * _grown(k_d * ahead)[:, None], log_J * _grown(k_v * ahead)
@@ -224,28 +228,25 @@ def hencky_branch(real: type) -> tuple[wp.Function, wp.Function, wp.Function]:
 
 @functools.cache
 def _corotated(real: type) -> wp.Function:
-    """corotated(H, mu, lam) -> stress of the elastic branch."""
+    """corotated(H, j, mu, lam) -> stress of the elastic branch, j = J - 1."""
     mat33 = matrix(real)
-    volume_change, cofactor = volume.volume_change(real), volume.cofactor(real)
     stretch, adjoint_of_stretch = polar.stretch(real), polar.adjoint_of_stretch(real)
 
     @wp.func(name=f"corotated_{real.__name__}")
-    def corotated(H: mat33, mu: real, lam: real):
+    def corotated(H: mat33, j: real, mu: real, lam: real):
         Y = stretch(H)
-        j = volume_change(H)
         return real(2.0) * mu * (Y + Y * Y) + lam * (real(1.0) + j) * j * wp.identity(n=3, dtype=real)
 
     @wp.func_grad(corotated)
-    def adj_corotated(H: mat33, mu: real, lam: real, adj_ret: mat33):
+    def adj_corotated(H: mat33, j: real, mu: real, lam: real, adj_ret: mat33):
         one = wp.identity(n=3, dtype=real)
         Y = stretch(H)
-        j = volume_change(H)
         A = real(0.5) * (adj_ret + wp.transpose(adj_ret))
         AY = A * Y
         trace = wp.trace(A)
-        F = one + H
         adj_Y = real(2.0) * mu * (A + AY + wp.transpose(AY))
-        wp.adjoint[H] += adjoint_of_stretch(F, one + Y, adj_Y) + lam * (real(1.0) + real(2.0) * j) * trace * cofactor(F)
+        wp.adjoint[H] += adjoint_of_stretch(one + H, one + Y, adj_Y)
+        wp.adjoint[j] += lam * (real(1.0) + real(2.0) * j) * trace
         wp.adjoint[mu] += real(2.0) * (wp.trace(AY) + wp.ddot(AY, Y))
         wp.adjoint[lam] += (real(1.0) + j) * j * trace
 
@@ -288,10 +289,10 @@ def maxwell_branches(branches: int, spring: str, flow: str, real: type) -> wp.Fu
 @functools.cache
 def _advance(branches: int, elastic: bool, spring: str, flow: str, real: type) -> wp.Function:
     mat33 = matrix(real)
-    corotated = _corotated(real)
+    corotated, carried_volume = _corotated(real), volume.carried_volume(real)
     all_branches = maxwell_branches(branches, spring, flow, real)
     key = f"{branches}_{'elastic' if elastic else 'viscous'}_{spring}_{flow}_{real.__name__}"
-    first = 2 if elastic else 0
+    first, row = (2, 1) if elastic else (0, 0)
 
     @wp.func(name=f"viscoelastic_{key}")
     def advance(
@@ -300,16 +301,18 @@ def _advance(branches: int, elastic: bool, spring: str, flow: str, real: type) -
         L: mat33,  # velocity gradient [1/s]
         H: mat33,  # F - I
         coefficients: wp.array2d(dtype=real),  # mu, lam [Pa], then mu_N, K_N [Pa], k_d, k_v [1/s] of each branch
-        memory: wp.array2d(dtype=real),  # of each branch: upper triangle of b_N - I, by how much it is ahead [s]
+        memory: wp.array2d(dtype=real),  # J - 1, then of each branch b_N - I and its lead [s]
         memory_next: wp.array2d(dtype=real),
     ):
         M = dt * L
         H_next = H + M + M * H
         tau = mat33()
         if wp.static(elastic):
-            tau = tau + corotated(H_next, coefficients[0, p], coefficients[1, p])
+            j = carried_volume(memory[0, p], M)
+            memory_next[0, p] = j
+            tau = tau + corotated(H_next, j, coefficients[0, p], coefficients[1, p])
         if wp.static(branches):
-            tau = tau + all_branches(p, dt, M, first, 0, coefficients, memory, memory_next)
+            tau = tau + all_branches(p, dt, M, first, row, coefficients, memory, memory_next)
         return H_next, tau
 
     return without_replay(advance)

@@ -9,11 +9,13 @@ from mpm_bodies import every_material
 from physics3d.materials.base import AbstractMaterial
 from physics3d.materials.material_points import advance
 from physics3d.materials.mixture import Mixture
+from physics3d.materials.mooney_rivlin import MooneyRivlin
 from physics3d.materials.neo_hookean import NeoHookean
 from physics3d.materials.newtonian import Newtonian
 from physics3d.materials.viscoelastic import Viscoelastic
 from physics3d.materials.von_mises import VonMises
 from physics3d.materials.with_branches import WithBranches
+from physics3d.materials.yeoh import Yeoh
 
 ONE = torch.eye(3, dtype=torch.float64)
 
@@ -155,6 +157,42 @@ def test_stress_is_the_derivative_of_the_stored_energy(material, size, rng):
     # central differences: step^2, and round-off 1e-16 of the stiffness over the step, which is 1e-6 of the small stress
     accuracy = 1e-7 if size > 0.1 else 1e-5
     torch.testing.assert_close((tau * A).sum((1, 2)), power, rtol=1e-5, atol=accuracy * tau.abs().max().item())
+
+
+def small_strain_moduli(material) -> tuple[float, float]:
+    """(mu, lam) [Pa] of the solid at once after it is strained, by the handbook."""
+    example, mu, lam = material.example, 0.0, 0.0
+    if "poissons_ratio" in example:
+        E, nu = example["youngs_modulus"], example["poissons_ratio"]
+        mu, lam = E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu))
+    if isinstance(material, MooneyRivlin):
+        mu = 2 * (example["first_modulus"] + example["second_modulus"])
+        lam = example["bulk_modulus"] - 2 / 3 * mu
+    if isinstance(material, Yeoh):
+        mu = 2 * example["linear_modulus"]
+        lam = example["bulk_modulus"] - 2 / 3 * mu
+    for suffix in ("", "_2", "_3"):
+        if "branch_shear_modulus" + suffix in example:
+            mu_N, K_N = (example[f"branch_{name}_modulus{suffix}"] for name in ("shear", "bulk"))
+            mu, lam = mu + mu_N, lam + K_N - 2 / 3 * mu_N
+    return mu, lam
+
+
+def test_small_strains_have_the_moduli_of_the_handbook(material, rng):
+    """Hooke's law; sand and snow under enough pressure to hold, and the fluid by its volume alone."""
+    if isinstance(material, Mixture):
+        pytest.skip("its parts are tested")
+    mu, lam = small_strain_moduli(material)
+    strain = 1e-7 * random(rng, 6, 3, 3)
+    strain = strain + strain.mT
+    strain = strain - (strain.diagonal(dim1=1, dim2=2).mean(1) + 2e-6)[:, None, None] * ONE
+    tau, _, _ = walk(material, torch.zeros_like(strain), [strain], dt=1e-12)
+    trace = strain.diagonal(dim1=1, dim2=2).sum(1)[:, None, None]
+    expected = 2 * mu * strain + lam * trace * ONE
+    if isinstance(material, Newtonian):
+        tau, expected = tau.diagonal(dim1=1, dim2=2).sum(1), 3 * material.example["bulk_modulus"] * trace[:, 0, 0]
+    # the next order of strain, which bulk moduli of thirty shear moduli make 1e-4 of the shear
+    torch.testing.assert_close(tau, expected, rtol=1e-4, atol=1e-5 * float(expected.abs().max()))
 
 
 def test_no_energy_from_nothing(material, rng):
