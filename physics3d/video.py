@@ -1,5 +1,11 @@
-"""Videos: uint8 frames [t, h, w, 3], written and read as mp4 by the ffmpeg that imageio-ffmpeg brings."""
+"""Videos: uint8 frames [t, h, w, 3], written and read as mp4 by the ffmpeg that imageio-ffmpeg brings.
 
+ffmpeg is called here, not through imageio, which looks at neither its exit status nor its messages: a full disk would
+leave half a video that nobody is told of.
+"""
+
+import shutil
+import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,39 +41,82 @@ def ffmpeg() -> str:
     try:
         import imageio_ffmpeg
 
-        return imageio_ffmpeg.get_ffmpeg_exe()
+        program = imageio_ffmpeg.get_ffmpeg_exe()
+        found = shutil.which(program)
+        if found is None:
+            raise RuntimeError(f"{program} is no program")
+        return found
     except (ImportError, RuntimeError) as error:
         raise RuntimeError(
-            "no ffmpeg found: run `make setup` (imageio-ffmpeg brings one) or set IMAGEIO_FFMPEG_EXE to yours"
+            f"no ffmpeg found ({' '.join(str(error).split())}); run `make setup` (imageio-ffmpeg brings one) or set "
+            "IMAGEIO_FFMPEG_EXE to yours"
         ) from error
 
 
-def write_mp4(path: Path, frames: UInt8[Tensor, "t h w 3"], fps: float) -> None:
-    """Encode frames as H.264; odd sizes lose their last row or column, because yuv420p has none."""
-    import imageio.v2 as imageio
+def run_ffmpeg(arguments: list[str], frames: bytes = b"", folder: Path | None = None) -> bytes:
+    """Call ffmpeg in `folder` with `frames` as its input -> its output. Raises RuntimeError with what it says."""
+    command = [ffmpeg(), "-hide_banner", "-loglevel", "error", *arguments]
+    done = subprocess.run(command, input=frames, capture_output=True, cwd=folder)
+    if done.returncode:
+        lines = done.stderr.decode(errors="replace").strip().splitlines() or ["it said nothing"]
+        full = next((line for line in lines if "No space left" in line), lines[-1])
+        raise RuntimeError(f"ffmpeg failed with status {done.returncode}: {full.strip()}")
+    return done.stdout
 
-    ffmpeg()
-    array = np.asarray(frames)
-    h, w = (array.shape[1] // 2) * 2, (array.shape[2] // 2) * 2
+
+def write_mp4(path: Path, frames: UInt8[Tensor, "t h w 3"], fps: float) -> None:
+    """Encode frames as H.264; odd sizes lose their last row or column, because yuv420p has none.
+
+    Raises ValueError for frames that make no video, RuntimeError if ffmpeg fails; then no file is left.
+    """
+    t, h, w = frames.shape[:3]
+    h, w = h // 2 * 2, w // 2 * 2
+    if not (t and h and w and 0 < fps < float("inf")):
+        raise ValueError(
+            f"{path.name}: {t} frames of {frames.shape[2]} x {frames.shape[1]} px at {fps:g} per second make no video; "
+            "at least 1 frame, 2 x 2 px and a positive rate are needed (a larger render.scale?)"
+        )
     path.parent.mkdir(parents=True, exist_ok=True)
-    with imageio.get_writer(
-        path, fps=fps, codec="libx264", quality=8, macro_block_size=2, ffmpeg_log_level="error"
-    ) as out:
-        for frame in array[:, :h, :w]:
-            out.append_data(frame)  # type: ignore[attr-defined]
+    target = str(path.absolute())  # no name is then an option or a protocol of ffmpeg
+    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{w}x{h}", "-r", f"{fps:.9g}", "-i", "-"]
+    coding = ["-an", "-c:v", "libx264", "-crf", "10", "-pix_fmt", "yuv420p", "-y", target]
+    try:
+        run_ffmpeg([*source, *coding], np.ascontiguousarray(np.asarray(frames)[:, :h, :w]).tobytes())
+        # some versions end with status 0 although the last blocks did not fit on the disk: count what arrived
+        told = run_ffmpeg(["-i", target, "-map", "0:v:0", "-c", "copy", "-f", "framecrc", "-"])
+        packets = sum(not line.startswith(b"#") for line in told.splitlines())
+        if packets != t:
+            raise RuntimeError(f"{path} holds {packets} of {t} frames; is the disk full?")
+    except BaseException:
+        path.unlink(missing_ok=True)
+        raise
 
 
 def read_mp4(path: Path) -> tuple[UInt8[Tensor, "t h w 3"], float]:
-    """Decode a video -> (frames, fps). Raises ValueError naming the file if it cannot be read."""
-    import imageio.v2 as imageio
+    """Decode a video, turned as it says -> (frames, fps). Raises ValueError naming the file if it cannot be read to its
+    end.
 
-    ffmpeg()
+    Frames are evenly spaced in time: those of a variable rate (telephones, browsers) are taken at their mean rate.
+    """
     if not path.is_file():
         raise ValueError(f"no video at {path}; check the path in the scene's configuration")
+    import imageio_ffmpeg
+
+    ffmpeg()
+    target = str(path.absolute())
     try:
-        with imageio.get_reader(path) as reader:
-            fps = float(reader.get_meta_data()["fps"])  # type: ignore[attr-defined]
-            frames = np.stack([np.asarray(frame) for frame in reader])  # type: ignore[attr-defined]
-    except Exception as error:
-        raise ValueError(f"cannot read the video {path}: {error}") from error
-    return torch.from_numpy(frames), fps
+        opened = imageio_ffmpeg.read_frames(target)
+        told = next(opened)
+        opened.close()
+        w, h = told["size"]
+        count, seconds = imageio_ffmpeg.count_frames_and_secs(target)
+        even = abs(told["fps"] * seconds - count) <= max(2, 0.05 * count)
+        fps = float(told["fps"]) if even else round(count / seconds, 3)
+        rate = ["-fps_mode", "passthrough"] if even else ["-vf", f"fps={fps}"]
+        decoded = run_ffmpeg(["-xerror", "-i", target, "-f", "rawvideo", "-pix_fmt", "rgb24", *rate, "-"])
+        array = np.frombuffer(bytearray(decoded), np.uint8).reshape(-1, h, w, 3)
+        if not len(array):
+            raise ValueError("it holds no frames")
+    except (OSError, RuntimeError, ValueError, StopIteration) as error:
+        raise ValueError(f"cannot read the video {path}: {' '.join(str(error).split())[:200]}") from error
+    return torch.from_numpy(array), fps

@@ -2,7 +2,6 @@
 material."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +19,7 @@ from physics3d.metrics.video import vmaf
 from physics3d.scenes.base import Capture
 from physics3d.video import Video
 from physics3d.world import Estimate
-from stages.simulate import excited
+from stages.simulate import Force, excited
 
 DIFFERENT = "the simulated excitation is not the one that was filmed: only the eye may compare"
 
@@ -30,7 +29,7 @@ class Evaluate:
     """Scores videos against the take with role "evaluate", or against the held-out cameras of the one learned from."""
 
     excitation: tuple[AbstractBoundary, ...] | None = None  # what was simulated; None: what the take was excited by
-    force: Mapping[str, float] | None = None  # of its impulses, as in Simulate [N]
+    force: Force | None = None  # of its impulses, as in Simulate [N]
 
     def __call__(
         self, capture: Capture, videos: dict[str, Video], estimates: dict[str, Estimate], *, log: Log

@@ -3,12 +3,28 @@
 
 import math
 from dataclasses import dataclass, replace
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
+from annotated_types import Ge, Gt, Le
 from torch import Tensor
 
+from physics3d.checks import (
+    Device,
+    Duration,
+    Frames,
+    NamesOf,
+    NotNegative,
+    Positive,
+    Seed,
+    Text,
+    Whole,
+    at_least_one,
+    require_fields,
+)
 from physics3d.filling.body import Body
+from physics3d.filling.in_world import look_ahead
 from physics3d.gaussians.model import Gaussians
 from physics3d.learning.chain import chain_of
 from physics3d.learning.curves import curves
@@ -21,8 +37,10 @@ from physics3d.learning.search import search
 from physics3d.log import Log
 from physics3d.pictures import contact_sheet, to_uint8
 from physics3d.priors.base import AbstractPrior
-from physics3d.scenes.base import Capture, Take
+from physics3d.scenes.base import Capture, Footage, Outline
 from physics3d.world import Estimate, World
+
+Span = Annotated[float, Gt(1), Le(1e12)]  # a factor
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,39 +49,45 @@ class Learn:
 
     world: World
     prior: AbstractPrior
-    learn: tuple[str, ...]  # parameters that may change; the others keep the value of world.start
+    learn: tuple[Text, ...]  # parameters that may change; the others keep the value of world.start
     ties: tuple[
-        tuple[str, ...], ...
+        tuple[Text, ...], ...
     ] = ()  # groups that share one factor, e.g. [[youngs_modulus, branch_shear_modulus]]
     learn_velocity: bool = False  # one initial velocity for the whole body
-    steps: int = 30  # of gradient descent
-    polish: int = 0  # Gauss-Newton steps after the descent; one costs a forward run per parameter and two
-    learning_rate: float = 0.1  # first step of theta: 0.1 is ten per cent of a parameter
-    duration: float | None = None  # only the first part of the take is used [s]; None: all of it
-    frames: int = 15  # of the take, evenly spaced over the duration
-    frames_per_step: int = 0  # drawn anew for each step, spread over all of them; 0: all (diffusion priors need all)
-    views_per_step: int = 1  # cameras drawn anew for each step; 0: all; held-out cameras are never used
-    image_scale: float = 0.5  # pixels rendered per pixel of the take, along each side
-    search: int = 0  # stiffness factors tried before descending: a grid of that many, so that no period is skipped
-    search_span: float = 10.0  # ... between 1/span and span, equally spaced in the logarithm
-    stay: float = 0.01  # pull to the start: cost of a factor e, in units of half the loss at the start
-    span: float = 100.0  # a parameter stays within start/span .. start*span
-    largest_gradient: float = 3.0  # clip of the global norm, in units of the loss at the start per unit of theta
-    device: str = "cpu"
-    seed: int = 0
+    steps: Whole = 30  # of gradient descent
+    polish: Whole = 0  # Levenberg steps after the descent; one costs a forward run per parameter and two
+    learning_rate: Annotated[float, Gt(0), Le(10)] = 0.1  # first step of theta: 0.1 is ten per cent of a parameter
+    duration: Duration | None = None  # only the first part of the take is used [s]; None: all of it
+    frames: Frames = 15  # of the take, spread over the duration
+    frames_per_step: Whole = 0  # drawn anew for each step, spread over all of them; 0: all (diffusion priors need all)
+    views_per_step: Whole = 1  # cameras drawn anew for each step; 0: all; held-out cameras are never used
+    image_scale: Annotated[float, Gt(0), Le(16)] = 0.5  # pixels rendered per pixel of the take, along each side
+    # stiffness factors tried before descending: a grid of that many, so that no period is skipped
+    search: Literal[0] | Annotated[int, Ge(2), Le(10_000)] = 0
+    search_span: Span = 10.0  # ... between 1/span and span, equally spaced in the logarithm
+    stay: NotNegative = 0.01  # pull to the start: cost of a factor e, in units of half the loss at the start
+    span: Span = 100.0  # a parameter stays within start/span .. start*span
+    largest_gradient: Positive = 3.0  # clip of the global norm, in units of the loss at the start per unit of theta
+    device: Device = "cpu"
+    seed: Seed = 0
+
+    RULES = (
+        at_least_one("learn", "ties", "learn_velocity"),
+        NamesOf("learn", "world.start"),
+        NamesOf("ties", "world.start"),
+    )
 
     def __post_init__(self):
-        counts = ("steps", "polish", "frames_per_step", "views_per_step", "search")
-        for name, lowest in (("frames", 2), *((name, 0) for name in counts)):
-            if getattr(self, name) < lowest:
-                raise ValueError(f"learn.{name} is {getattr(self, name)}; it must be at least {lowest}")
-        for name in ("learning_rate", "image_scale", "largest_gradient"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"learn.{name} is {getattr(self, name):g}; it must be positive")
-        if not self.search_span > 1 or not self.stay >= 0:
-            raise ValueError(
-                f"learn.search_span ({self.search_span:g}) must be above 1 and learn.stay ({self.stay:g}) >= 0"
-            )
+        require_fields(self, "learn")
+        field = self.field(self.world.estimate(), speed=1.0)
+        if self.search:
+            self.directions(field)
+
+    def fits(self, outline: Outline) -> None:
+        """Raise ValueError if a take of this outline is too short, as far as that is known."""
+        for take in outline.takes or ():
+            if take.role == "learn":
+                self.spread(take)
 
     def __call__(self, capture: Capture, gaussians: Gaussians, body: Body, *, log: Log) -> Estimate:
         """Raises ValueError if there is no take to learn from, or a name, frame count or camera does not fit."""
@@ -73,16 +97,10 @@ class Learn:
                 f"capture {capture.name} has no take with role learn; leave out the learning, or record a motion"
             )
         start = self.world.estimate()
-        indices = self.indices(take)
+        look_ahead(body, self.world, take.excitation, log)
+        indices = self.spread(take.footage)
         seconds = int(indices[-1]) / take.fps
-        field = GlobalField(
-            start=start.parameters,
-            learn=self.learn,
-            ties=self.ties,
-            span=self.span,
-            start_velocity=start.velocity,
-            velocity_scale=self.natural_speed(body, seconds) if self.learn_velocity else None,
-        )
+        field = self.field(start, speed=self.natural_speed(body, seconds))
         chain = chain_of(
             self.world,
             self.prior,
@@ -137,9 +155,11 @@ class Learn:
             )
         return learned
 
-    def indices(self, take: Take) -> Tensor:
-        """The frames of the take that are used: every stride-th, from the first."""
-        total = len(take.videos[0])
+    def spread(self, take: Footage) -> Tensor:
+        """Which frames of the take are used: the first, and others spread over all of the duration.
+
+        They are equally far apart where what that leaves at the end is shorter than one stride, else to a frame."""
+        total = take.frames
         if self.duration is not None:
             total = min(total, math.floor(self.duration * take.fps + 1e-6) + 1)
         if self.frames > total:
@@ -147,23 +167,45 @@ class Learn:
                 f"learn.frames is {self.frames}, but take {take.name} has {total} frames"
                 f"{'' if self.duration is None else f' in {self.duration:g} s'}; lower it or raise learn.duration"
             )
-        stride = (total - 1) // (self.frames - 1)
-        return torch.arange(self.frames) * stride
+        stride, rest = divmod(total - 1, self.frames - 1)
+        if rest < stride:
+            return torch.arange(self.frames) * stride
+        return torch.linspace(0, total - 1, self.frames, dtype=torch.float64).round().long()
+
+    def field(self, start: Estimate, *, speed: float) -> GlobalField:
+        """What theta means; `speed` [m/s] is the unit of an initial velocity. Raises ValueError as GlobalField does."""
+        return GlobalField(
+            start=start.parameters,
+            learn=self.learn,
+            ties=self.ties,
+            span=self.span,
+            start_velocity=start.velocity,
+            velocity_scale=speed if self.learn_velocity else None,
+        )
 
     def natural_speed(self, body: Body, seconds: float) -> float:
         """Its own size per duration of the clip [m/s]: the unit in which the initial velocity is learned."""
         size = body.position.amax(0) - body.position.amin(0)
         return float(size.norm()) / seconds
 
-    def searched(self, chain: Chain, field: GlobalField, log: Log) -> Tensor:
+    def directions(self, field: GlobalField) -> Tensor:
+        """1 for the components of theta that are a stiffness, else 0. Raises ValueError if none is."""
         directions = torch.tensor([float(name.split("+")[0].endswith("modulus")) for name in field.names]).double()
         if not directions.any():
             raise ValueError(
                 f"learn.search = {self.search} looks for a stiffness, but no modulus is learned; set it to 0"
             )
+        return directions
+
+    def searched(self, chain: Chain, field: GlobalField, log: Log) -> Tensor:
         limit = math.log(self.search_span)
         return search(
-            chain, field, directions, np.linspace(-limit, limit, self.search).tolist(), seed=self.seed, log=log
+            chain,
+            field,
+            self.directions(field),
+            np.linspace(-limit, limit, self.search).tolist(),
+            seed=self.seed,
+            log=log,
         )
 
     def history(self, field: GlobalField, history: dict[str, list[float]]) -> dict[str, list[float]]:

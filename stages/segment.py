@@ -1,15 +1,18 @@
 """Photographs + Gaussians + what a person pointed at -> which Gaussians may move."""
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 import torch
+from annotated_types import Ge
 
+from physics3d.checks import Count, Device, Pixels, Whole, require_fields
 from physics3d.gaussians.model import Gaussians
 from physics3d.gaussians.render import render
 from physics3d.log import Log
 from physics3d.pictures import tiled
-from physics3d.scenes.base import Capture
+from physics3d.scenes.base import Capture, Outline
 from physics3d.segmentation import Segmentation
 from physics3d.segmentation.belief import one_hot, shares
 from physics3d.segmentation.carry_masks import carry_masks, refined_masks
@@ -33,15 +36,34 @@ class Segment:
 
     prompts: tuple[Prompt, ...] = ()
     masker: AbstractMasker = field(default_factory=GrabCut)
-    views: int = 16  # photographs that are masked, spread around the object
-    size: int = 480  # longer side of the photographs as they are masked [px]
-    rounds: int = 2  # of masking every photograph again, by what all together say
-    device: str = "cpu"
+    views: Count = 16  # photographs that are masked, spread around the object
+    size: Annotated[Pixels, Ge(32)] = 480  # longer side of the photographs as they are masked [px]
+    rounds: Whole = 2  # of masking every photograph again, by what all together say
+    device: Device = "cpu"
+
+    def check(self) -> None:
+        """Raise ValueError naming field, value and remedy."""
+        require_fields(self, "segment")
+        for prompt in self.prompts:
+            prompt.check()
+
+    def fits(self, outline: Outline) -> None:
+        """Raise ValueError if a prompt is for a photograph that is not there, as far as that is known."""
+        if not outline.names:
+            return
+        for prompt in self.prompts:
+            if prompt.in_image:
+                _index(outline, prompt.view)
+        if not self.prompts and outline.mattes is False:
+            raise ValueError(
+                f"segment.prompts is empty and {outline.name} has no mattes; say what moves, e.g. "
+                "scene.prompts=[{view: 0, box: [0.3, 0.2, 0.7, 0.8]}] in fractions of width and height"
+            )
 
     def __call__(self, capture: Capture, gaussians: Gaussians, *, log: Log) -> Segmentation:
         """Raises ValueError naming view and prompt if a prompt is outside the image or finds nothing."""
-        for prompt in self.prompts:
-            prompt.check()
+        self.check()
+        self.fits(capture.outline)
         parts = tuple(dict.fromkeys(p.part for p in self.prompts)) or ("body",)
         gaussians = gaussians.to(self.device)
 
@@ -72,12 +94,9 @@ class Segment:
                     f"no Gaussian belongs to {part!r}; correct segment.prompts, see the previews of segment"
                 )
         log.info(f"{int(apart.sum())} Gaussians of small islands went back to static")
-        log.info(
-            f"{int(touch.sum())} moving Gaussians lie next to static ones"
-            + ("; the body is attached there" if touch.any() else "; nothing holds the body")
-        )
+        log.info(f"{int(touch.sum())} moving Gaussians lie next to static ones")
         log.metric("islands", int(apart.sum()))
-        log.metric("attached", int(touch.sum()))
+        log.metric("beside_static", int(touch.sum()))
         self._show(capture, gaussians, label, log)
 
         masks = None
@@ -92,13 +111,8 @@ class Segment:
         self, capture: Capture, gaussians: Gaussians, parts: tuple[str, ...]
     ) -> tuple[dict[str, tuple[View, np.ndarray]], dict[str, Room]]:
         """For each part that is prompted in an image: that view with its mask, and the space that the part may take."""
-        if not self.prompts and not capture.alphas:
-            raise ValueError(
-                f"segment.prompts is empty and {capture.name} has no mattes; say what moves, e.g. "
-                "prompts=[{view: 0, box: [0.3, 0.2, 0.7, 0.8]}] in fractions of width and height"
-            )
         said: dict[str, tuple[View, np.ndarray]] = {}
-        in_image = [(p, _index(capture, p.view)) for p in self.prompts if p.in_image]
+        in_image = [(p, _index(capture.outline, p.view)) for p in self.prompts if p.in_image]
         for index in dict.fromkeys(index for _, index in in_image):
             view, here = view_of(capture, gaussians, index, self.size), [p for p, i in in_image if i == index]
             masks = {}
@@ -179,8 +193,6 @@ class Segment:
 
     def _views(self, capture: Capture, gaussians: Gaussians, said, rooms: dict[str, Room], log: Log) -> list[View]:
         """The prompted views, and training photographs that show the parts whole, spread by farthest camera."""
-        if self.views < 1:
-            raise ValueError(f"segment.views is {self.views}, must be at least 1")
         first = list(dict.fromkeys(view.index for view, _ in said.values()))
         training = [i for i in range(len(capture.images)) if i not in capture.held_out or i in first]
         whole = [i for i in training if i in first or all(r.whole_in(capture.cameras[i]) for r in rooms.values())]
@@ -223,15 +235,16 @@ class Segment:
             log.image(name, tiled(pictures))
 
 
-def _index(capture: Capture, view: str | int) -> int:
+def _index(outline: Outline, view: str | int) -> int:
     """Index of a view given by name or number. Raises ValueError listing some names."""
-    if isinstance(view, int) and 0 <= view < len(capture.names):
+    names = outline.names or ()
+    if isinstance(view, int) and 0 <= view < len(names):
         return view
-    if view in capture.names:
-        return capture.names.index(view)
+    if view in names:
+        return names.index(view)
     raise ValueError(
-        f"prompt: view {view!r} is not in {capture.name}; give an index below {len(capture.names)} or a name such as "
-        + ", ".join(capture.names[:3])
+        f"prompt: view {view!r} is not in {outline.name}; give an index below {len(names)} or a name such as "
+        + ", ".join(names[:3])
     )
 
 

@@ -1,12 +1,32 @@
-"""Where the tests find real data, and a generator of random numbers that is the same every time."""
+"""Annotations are checked in every test; where real data lies; random numbers that are the same every time."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from jaxtyping import config, install_import_hook
 
 ROOT = Path(__file__).resolve().parent.parent
+
+
+def with_checked_shapes() -> list[str]:
+    """The modules of library and stages that have no Warp kernels: those are another language."""
+    files = [path for folder in ("physics3d", "stages") for path in sorted((ROOT / folder).rglob("*.py"))]
+    plain = [path for path in files if path.name != "__init__.py" and "@wp." not in path.read_text()]
+    return [".".join(path.relative_to(ROOT).with_suffix("").parts) for path in plain]
+
+
+install_import_hook(with_checked_shapes(), "shapes.checked")  # before any of them is imported
+
+
+@pytest.fixture
+def unchecked() -> Iterator[None]:
+    """For tests of what our own code says of a wrong shape."""
+    config.update("jaxtyping_disable", True)
+    yield
+    config.update("jaxtyping_disable", False)
 
 
 @pytest.fixture

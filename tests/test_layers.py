@@ -10,11 +10,13 @@ ROOT = Path(__file__).resolve().parent.parent
 SOURCES = sorted(p for folder in ("physics3d", "stages", "pipeline") for p in (ROOT / folder).rglob("*.py"))
 BOTTOM = (
     "physics3d.artifact",
+    "physics3d.checks",
     "physics3d.video",
     "physics3d.pictures",
     "physics3d.log",
     "physics3d.open3d_import",
     "physics3d.warp_types",
+    "physics3d.warp_start",
     "physics3d.clusters",
     "physics3d.trajectory",
 )

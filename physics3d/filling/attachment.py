@@ -29,7 +29,7 @@ def attached_particles(position: np.ndarray, spacing: float, static: Gaussians, 
             attached = distance < min(max(least, 1.3 * distance.min()), reach)
     if not attached.any():
         log.metric("attached", 0)
-        log.info("nothing static touches the body: it is held nowhere, unless the scene names a fixed region")
+        log.info("nothing static touches the body: it is held by what scene.boundaries hold, if anything")
         return attached
     where = position[attached]
     patch = clusters(where, 3 * spacing)

@@ -6,8 +6,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from physics3d.artifact import AbstractArtifact, require_finite
-from physics3d.boundaries.base import AbstractBoundary
-from physics3d.boundaries.fixed_region import FixedRegion
 from physics3d.boundaries.held_particles import HeldParticles
 from physics3d.gaussians.embedding import Embedding
 
@@ -23,11 +21,10 @@ class Body(AbstractArtifact):
     attached: Bool[Tensor, " p"] | None = None  # beside something static, which holds them there; None: nothing is
     parts: tuple[str, ...] = ()  # names of the segmentation's parts; empty: they have none
 
-    def held(self, boundaries: tuple[AbstractBoundary, ...]) -> tuple[AbstractBoundary, ...]:
-        """What holds the body where it is attached: nothing if the scene's `boundaries` say where it is fixed."""
+    @property
+    def held(self) -> tuple[HeldParticles, ...]:
+        """What holds the body where it is attached, besides what the scene's boundaries hold; empty: it is not."""
         if self.attached is None or not bool(self.attached.any()):
-            return ()
-        if any(isinstance(b, FixedRegion | HeldParticles) for b in boundaries):
             return ()
         return (HeldParticles(position=self.position[self.attached]),)
 

@@ -27,7 +27,7 @@ from physics3d.filling.body import Body
 from physics3d.filling.cells import solid_cells
 from physics3d.filling.ground import Ground, ground
 from physics3d.filling.pieces import ISOLATED, join_pieces
-from physics3d.filling.seen import Seen, seen
+from physics3d.filling.seen import LIMB, Seen, seen
 from physics3d.filling.sheets import sheet
 from physics3d.filling.solids import AbstractSolid
 from physics3d.filling.surface import Surface, over_discs, sample_surface
@@ -83,7 +83,7 @@ def fill(
     position, volume = solid_cells(inside, surface.point, spacing)
     inner = cKDTree(surface.point).query(position)[0] > spacing if len(position) else np.zeros(0, bool)
 
-    bare = _uncovered(surface, position, view, spacing)
+    bare = _uncovered(surface, deviation, position, view, spacing)
     flat, area = sheet(surface.point[bare], surface.normal[bare], spacing)
     thickness = sheet_thickness
     if thickness is None and bare.any():
@@ -149,6 +149,11 @@ def showing(moving: Gaussians, opacity: float, log: Log) -> tuple[Int[Tensor, " 
 
 def _check_size(shown: Gaussians, spacing: float) -> None:
     size = np.ptp(shown.mean.double().numpy(), 0)
+    if size.max() < 2 * spacing:
+        raise ValueError(
+            f"fill.spacing is {spacing:g} m, and the body {size.max():.3g} m: smaller than a cell of the grid, two "
+            f"spacings; take at most {size.max() / 30:.2g} m, and scene.dx twice that"
+        )
     if (size / spacing).max() > MOST_CELLS:
         raise ValueError(
             f"fill.spacing = {spacing:g} m cuts a body of {size.max():.3g} m into more than {MOST_CELLS} cells; "
@@ -194,11 +199,14 @@ def _bounded(
     return inside
 
 
-def _uncovered(surface: Surface, position: np.ndarray, view: Seen | None, spacing: float) -> np.ndarray:
+def _uncovered(
+    surface: Surface, deviation: np.ndarray, position: np.ndarray, view: Seen | None, spacing: float
+) -> np.ndarray:
     """Bool [m]: samples of the surface that no particle at `position` [p, 3] is near to; they are thin parts."""
     bare = np.ones(len(surface.point), bool)
     if len(position):
         bare = cKDTree(position).query(surface.point)[0] > 1.2 * spacing
-    if view is not None:  # nor is there a sheet where the cameras see none
-        bare &= ~view.beside(surface.point) & ~view.deep(surface.point)
+    if view is not None:  # nor is there a sheet where the cameras see none, from neither of its sides
+        side = LIMB * deviation[:, None] * surface.normal
+        bare &= ~view.beside(surface.point) & ~(view.deep(surface.point + side) & view.deep(surface.point - side))
     return bare

@@ -5,8 +5,9 @@ is its pictures. A camera tells of a point x at depth z, with the pixel it falls
 
     outline    (1/2 - m) / |slope of m|, m the share of the pixel that is the body's: where m < 1/2, x is not the body's
                unless something static hides it
-    depth      d - z where z < d + t: in front of what is seen there, or just behind it; d is the depth of the Gaussian
-               at which half the light is gone, if that is the body's, less twice its deviation along the ray
+    depth      d - z where z < d + t: in front of what is seen there, or just behind it; d is where the pixel's ray
+               meets the Gaussian at which half the light is gone, if that is the body's, less twice its deviation along
+               the ray: its centre may be as far beside the ray as it is broad
 
 Outlines exclude: the distance is the largest but for a tenth of the cameras, so that a few mistaken masks carve
 nothing. Depths are uncertain: the distance is their mean, cut off at the truncation t (Curless and Levoy 1996). The
@@ -25,6 +26,7 @@ from torch import Tensor
 from physics3d.gaussians.cameras import Camera
 from physics3d.gaussians.model import Gaussians
 from physics3d.gaussians.rasterize import rasterize
+from physics3d.gaussians.splat import LOW_PASS
 from physics3d.log import Log
 
 MOST_VIEWS = 32
@@ -97,7 +99,7 @@ def seen(
     covariance = gaussians.covariance()
     shown = (label > 0).to(gaussians.mean)[:, None].expand(-1, 3)
     floor = (1e-3 * spacing) ** 2 * torch.eye(3, dtype=torch.float64)  # discs of no thickness have an inverse too
-    mean, precision = gaussians.mean.double().cpu(), torch.linalg.inv(covariance.double().cpu() + floor)
+    mean, shape = gaussians.mean.double().cpu(), covariance.double().cpu() + floor
     moving = label.cpu() > 0
     which = np.unique(np.linspace(0, len(cameras) - 1, min(MOST_VIEWS, len(cameras))).round().astype(int))
     mistaken = max(len(which) // 10, int(len(which) > 1))  # cameras that may be
@@ -109,11 +111,8 @@ def seen(
             drawn = rasterize(
                 gaussians.mean, covariance, gaussians.opacity, shown, camera, background=(0.0, 0.0, 0.0), median=True
             )
-        ray = mean - camera.centre
-        ray = ray / (ray @ camera.world_to_camera[2, :3])[:, None]
-        deviation = torch.einsum("ni,nij,nj->n", ray, precision, ray).rsqrt().float()  # of the depth [m]
-        at, median = drawn.at.long().cpu(), drawn.median.cpu()  # type: ignore[union-attr]
-        front = torch.where(at >= 0, median - LIMB * deviation[at], FAR)
+        at = drawn.at.long().cpu()  # type: ignore[union-attr]
+        front = _front(at, mean, shape, camera)
         body = (at >= 0) & moving[at]
         shown_at, hidden_at = torch.where(body, front, -FAR), torch.where(body, FAR, front)
         uv, z = camera.project(x)
@@ -139,6 +138,29 @@ def seen(
         unseen=lattice(unseen & (outline[-1] <= 0)),
         truncation=t,
     )
+
+
+def _front(
+    at: Int[Tensor, "h w"], mean: Float[Tensor, "n 3"], shape: Float[Tensor, "n 3 3"], camera: Camera
+) -> Float[Tensor, "h w"]:
+    """Depth [m] of the near side of the Gaussian `at` every pixel, where the pixel's ray meets it; FAR for -1.
+
+    A Gaussian as it is drawn, with the low pass, is densest on the ray o + s d at s = (d P (m - o))/(d P d): of a disc
+    that is the place on it, however wide it is and wherever on it its centre lies.
+    """
+    chosen = at >= 0
+    which = at[chosen]
+    origin, direction = camera.rays(torch.float64)
+    d, away = direction[chosen], mean[which] - origin
+    depth = away @ camera.world_to_camera[2, :3].double()
+    blur = LOW_PASS / (camera.fx * camera.fy) * depth**2
+    drawn = torch.linalg.inv(shape[which] + blur[:, None, None] * torch.eye(3, dtype=torch.float64))
+    towards = torch.einsum("ni,nij->nj", d, drawn)
+    densest = (towards * away).sum(1) / (towards * d).sum(1)
+    deviation = torch.einsum("ni,nij,nj->n", d, torch.linalg.inv(shape[which]), d).rsqrt()
+    front = torch.full(at.shape, FAR)
+    front[chosen] = (densest - LIMB * deviation).float()
+    return front
 
 
 def _read(picture: Float[Tensor, "h w"], pixel: Float[Tensor, "m 2"], mode: str) -> Float[Tensor, " m"]:

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
+from physics3d.checks import Share
 from physics3d.filling.sheets import sample_area
 from physics3d.filling.surface import Surface
 from physics3d.open3d_import import open3d
@@ -27,7 +28,7 @@ class AbstractSolid:
 class Poisson(AbstractSolid):
     """Inside the screened Poisson surface of the samples that bound a volume. Closes missing caps."""
 
-    enclosure: float = 0.4  # least share of directions in which a point inside must meet the surface
+    enclosure: Share = 0.4  # least share of directions in which a point inside must meet the surface
 
     def inside(self, surface: Surface, spacing: float) -> Callable[[np.ndarray], np.ndarray]:
         chosen = ~surface.thin & ~surface.hidden

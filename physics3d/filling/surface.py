@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from physics3d.filling.enclosure import DIRECTIONS, Enclosure
 from physics3d.filling.ground import Ground
-from physics3d.filling.seen import Seen
+from physics3d.filling.seen import LIMB, Seen
 from physics3d.gaussians.model import Gaussians
 from physics3d.log import Log
 
@@ -73,7 +73,7 @@ def sample_surface(
         return Surface(point + outward, normal, enclosure, thin=thin, hidden=hidden), deviation
 
     solid = ~thin & ~hidden
-    point, normal, found = _settled(point, normal, solid, view, spacing, log)
+    point, normal, found = _settled(point, normal, deviation, solid, view, spacing, log)
     hidden = hidden | (solid & ~found)
     if below is not None:
         end, downwards = _ends_below(view, below, spacing)
@@ -142,13 +142,28 @@ def _towards_the_sky(
 
 
 def _settled(
-    point: np.ndarray, normal: np.ndarray, solid: np.ndarray, view: Seen, spacing: float, log: Log
+    point: np.ndarray,
+    normal: np.ndarray,
+    deviation: np.ndarray,
+    solid: np.ndarray,
+    view: Seen,
+    spacing: float,
+    log: Log,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Samples of solid parts moved onto the surface that cameras see, their normals there, and which found it."""
-    moved, outside, found = view.settled(point, 1.5 * spacing)
+    """Samples of solid parts moved onto the surface that cameras see, their normals there, and which found it.
+
+    They start where Gaussians show, `LIMB` deviations outside of their centres.
+    """
+    moved, outside, found = view.settled(point + LIMB * deviation[:, None] * normal, 1.5 * spacing)
     share = float(found[solid].mean()) if solid.any() else 1.0
     log.info(f"{100 * share:.0f} % of the samples of solid parts are near the surface that the cameras see")
     if share < LEAST_SEEN:
+        if np.median(deviation[solid]) > 0.75 * spacing:
+            raise ValueError(
+                f"the Gaussians of the body are {2e3 * np.median(deviation[solid]):.3g} mm thick, and its particles "
+                f"{1e3 * spacing:.3g} mm apart: no surface can be seen so well; reconstruct longer or with more "
+                "Gaussians, or take a larger scene.spacing and scene.dx"
+            )
         raise ValueError(
             f"the cameras see the surface of the body near {100 * share:.1f} % of its Gaussians only; cameras, "
             "Gaussians and labels do not belong together: look at the previews of reconstruct and segment"

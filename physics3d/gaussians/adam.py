@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from physics3d.checks import Factor, NotNegative, require_fields
 from physics3d.gaussians.model import FIELDS, Gaussians
 
 Moments = dict[str, tuple[Tensor, Tensor]]  # per field of Gaussians; they follow splits and removals
@@ -15,13 +16,17 @@ Moments = dict[str, tuple[Tensor, Tensor]]  # per field of Gaussians; they follo
 class Rates:
     """Step sizes of Adam at the start; they fall to `final` of it, exponentially."""
 
-    mean: float = 1e-3  # times the extent of the scene
-    log_scale: float = 8e-2
-    quaternion: float = 2e-2
-    opacity_logit: float = 5e-2
-    sh: float = 1e-2  # degree 0; the higher ones learn 10 times slower
-    exposure: float = 1e-2  # of a photograph, where exposures are learned
-    final: float = 0.05
+    mean: NotNegative = 1e-3  # times the extent of the scene
+    log_scale: NotNegative = 8e-2
+    quaternion: NotNegative = 2e-2
+    opacity_logit: NotNegative = 5e-2
+    sh: NotNegative = 1e-2  # degree 0; the higher ones learn 10 times slower
+    exposure: NotNegative = 1e-2  # of a photograph, where exposures are learned
+    final: Factor = 0.05
+
+    def check(self) -> None:
+        """Raise ValueError naming field, value and remedy."""
+        require_fields(self, "rates")
 
 
 def stepped(model: Gaussians, moments: Moments, rates: Rates, extent: float, step: int, fall: float) -> Gaussians:

@@ -87,16 +87,16 @@ def blending(real, tile: int, side: int):
     def blend(
         # in
         begin: int,  # first square of this launch
-        start: wp.array(dtype=int),  # first pair of every tile, and one past the last
-        gaussian: wp.array(dtype=int),
-        splat: wp.array(dtype=entry),
+        start: wp.array(dtype=int),  # [tile + 1] first pair of every tile, and one past the last
+        gaussian: wp.array(dtype=int),  # [pair] index of the Gaussian
+        splat: wp.array(dtype=entry),  # [n] what is drawn of a Gaussian
         background: wp.array(dtype=real),  # [3]
-        view: View,
+        view: View,  # camera and what of its picture is drawn
         # out
         color: wp.array3d(dtype=real),  # [h, w, 3]
-        alpha: wp.array2d(dtype=real),
-        depth: wp.array2d(dtype=real),  # [m]
-        clear: wp.array2d(dtype=real),  # transmittance
+        alpha: wp.array2d(dtype=real),  # [h, w]
+        depth: wp.array2d(dtype=real),  # [h, w] [m]
+        clear: wp.array2d(dtype=real),  # [h, w] transmittance
     ):
         width = view.width
         height = view.height
@@ -172,19 +172,19 @@ def blending(real, tile: int, side: int):
     @wp.kernel(module="unique", enable_backward=False, module_options=options)
     def blend_adjoint(
         # in
-        begin: int,
+        begin: int,  # first square of this launch
         part: int,  # which private block of sums this launch adds to
-        start: wp.array(dtype=int),
-        gaussian: wp.array(dtype=int),
-        splat: wp.array(dtype=entry),
-        view: View,
-        color: wp.array3d(dtype=real),
-        alpha: wp.array2d(dtype=real),
-        depth: wp.array2d(dtype=real),
-        clear: wp.array2d(dtype=real),
-        color_bar: wp.array3d(dtype=real),  # adjoints; empty ones are zero
-        alpha_bar: wp.array2d(dtype=real),
-        depth_bar: wp.array2d(dtype=real),
+        start: wp.array(dtype=int),  # [tile + 1] first pair of every tile, and one past the last
+        gaussian: wp.array(dtype=int),  # [pair] index of the Gaussian
+        splat: wp.array(dtype=entry),  # [n] what is drawn of a Gaussian
+        view: View,  # camera and what of its picture is drawn
+        color: wp.array3d(dtype=real),  # [h, w, 3]
+        alpha: wp.array2d(dtype=real),  # [h, w]
+        depth: wp.array2d(dtype=real),  # [h, w] [m]
+        clear: wp.array2d(dtype=real),  # [h, w] transmittance
+        color_bar: wp.array3d(dtype=real),  # [h, w, 3] adjoints; empty ones are zero
+        alpha_bar: wp.array2d(dtype=real),  # [h, w]
+        depth_bar: wp.array2d(dtype=real),  # [h, w]
         # out
         sums: wp.array2d(dtype=entry),  # [part, n] adjoint of `splat`, added to
     ):
@@ -315,13 +315,13 @@ def blending(real, tile: int, side: int):
     @wp.kernel(module="unique", enable_backward=False, module_options=options)
     def find_middle(
         # in
-        begin: int,
-        start: wp.array(dtype=int),
-        gaussian: wp.array(dtype=int),
-        splat: wp.array(dtype=entry),
-        view: View,
+        begin: int,  # first square of this launch
+        start: wp.array(dtype=int),  # [tile + 1] first pair of every tile, and one past the last
+        gaussian: wp.array(dtype=int),  # [pair] index of the Gaussian
+        splat: wp.array(dtype=entry),  # [n] what is drawn of a Gaussian
+        view: View,  # camera and what of its picture is drawn
         # out
-        middle: wp.array2d(dtype=int),  # Gaussian at which the transmittance falls below one half; -1 where it does not
+        middle: wp.array2d(dtype=int),  # [h, w] Gaussian at which the transmittance falls below 1/2; -1: it does not
     ):
         width = view.width
         height = view.height

@@ -59,16 +59,16 @@ def projection(real, tile: int):
     def project(
         # in
         begin: int,  # first Gaussian of this launch
-        mean: wp.array(dtype=vec3),  # [m]
-        covariance: wp.array(dtype=mat33),  # [m^2]
-        opacity: wp.array(dtype=real),
-        color: wp.array(dtype=vec3),
-        view: View,
+        mean: wp.array(dtype=vec3),  # [n] [m]
+        covariance: wp.array(dtype=mat33),  # [n] [m^2]
+        opacity: wp.array(dtype=real),  # [n] 0..1
+        color: wp.array(dtype=vec3),  # [n] 0..1
+        view: View,  # camera and what of its picture is drawn
         # out
-        splat: wp.array(dtype=entry),  # opacity 0 where invisible
-        depth: wp.array(dtype=wp.float32),  # [m], to sort by
-        index: wp.array(dtype=int),  # 0, 1, 2, ...
-        count: wp.array(dtype=int),  # number of tiles touched
+        splat: wp.array(dtype=entry),  # [n] opacity 0 where invisible
+        depth: wp.array(dtype=wp.float32),  # [n] [m], to sort by
+        index: wp.array(dtype=int),  # [n] 0, 1, 2, ...
+        count: wp.array(dtype=int),  # [n] number of tiles touched
     ):
         i = begin + wp.tid()
         X = view.R @ mean[i] + view.t
@@ -110,15 +110,15 @@ def projection(real, tile: int):
     @wp.kernel(module="unique", enable_backward=False)
     def list_tiles(
         # in
-        begin: int,
-        order: wp.array(dtype=int),  # Gaussians from near to far
-        last: wp.array(dtype=int),  # running sum of the tile counts in that order
-        count: wp.array(dtype=int),
-        splat: wp.array(dtype=entry),
-        view: View,
+        begin: int,  # first Gaussian of this launch
+        order: wp.array(dtype=int),  # [n] Gaussians from near to far
+        last: wp.array(dtype=int),  # [n] running sum of the tile counts in that order
+        count: wp.array(dtype=int),  # [n] number of tiles touched
+        splat: wp.array(dtype=entry),  # [n] what is drawn of a Gaussian
+        view: View,  # camera and what of its picture is drawn
         # out
-        tile: wp.array(dtype=int),  # of every pair (tile, Gaussian)
-        gaussian: wp.array(dtype=int),
+        tile: wp.array(dtype=int),  # [pair] of every pair (tile, Gaussian)
+        gaussian: wp.array(dtype=int),  # [pair] index of the Gaussian
     ):
         i = begin + wp.tid()
         g = order[i]
@@ -136,18 +136,18 @@ def projection(real, tile: int):
     @wp.kernel(module="unique", enable_backward=False)
     def project_adjoint(
         # in
-        begin: int,
-        mean: wp.array(dtype=vec3),
-        covariance: wp.array(dtype=mat33),
-        opacity: wp.array(dtype=real),
-        count: wp.array(dtype=int),
-        view: View,
+        begin: int,  # first Gaussian of this launch
+        mean: wp.array(dtype=vec3),  # [n] [m]
+        covariance: wp.array(dtype=mat33),  # [n] [m^2]
+        opacity: wp.array(dtype=real),  # [n] 0..1
+        count: wp.array(dtype=int),  # [n] number of tiles touched
+        view: View,  # camera and what of its picture is drawn
         sums: wp.array2d(dtype=entry),  # [part, n] adjoint of `splat`
         # out
-        mean_bar: wp.array(dtype=vec3),
-        covariance_bar: wp.array(dtype=mat33),
-        opacity_bar: wp.array(dtype=real),
-        color_bar: wp.array(dtype=vec3),
+        mean_bar: wp.array(dtype=vec3),  # [n]
+        covariance_bar: wp.array(dtype=mat33),  # [n]
+        opacity_bar: wp.array(dtype=real),  # [n]
+        color_bar: wp.array(dtype=vec3),  # [n]
     ):
         i = begin + wp.tid()
         X_bar = vec3()

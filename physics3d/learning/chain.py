@@ -1,5 +1,7 @@
 """How theta becomes a motion, a motion a clip, and which clips of a take it is compared with."""
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -28,7 +30,7 @@ def chain_of(
     image_scale: float,
     device: str,
 ) -> Chain:
-    """Of the frames `indices`, evenly spaced, of the cameras of the take that are not held out.
+    """Of the frames `indices`, ascending from 0, of the cameras of the take that are not held out.
 
     Pictures are drawn at `image_scale` of the take's size. Raises ValueError if all cameras are held out.
     """
@@ -45,6 +47,9 @@ def chain_of(
     rest, volume = body.position.to(device), body.volume.to(device)
     background = torch.tensor(capture.background, dtype=torch.float32, device=device)
     backdrops = {i: Backdrop.of(model, embedding, cameras[i], background=background) for i in views}
+    # rolled out at the largest step of which all frames are multiples
+    step = math.gcd(*indices.tolist())
+    at = (indices // step).tolist()
 
     def simulate(theta: Tensor):
         return rollout(
@@ -53,9 +58,9 @@ def chain_of(
             rest,
             volume,
             velocity=field.velocity(theta),
-            excitation=(*body.held(world.boundaries), *take.excitation),
-            frames=len(indices),
-            frame_dt=int(indices[1]) / take.fps,
+            excitation=(*body.held, *take.excitation),
+            frames=at[-1] + 1,
+            frame_dt=step / take.fps,
             device=device,
             log=Log(None),
         )
@@ -66,6 +71,6 @@ def chain_of(
                 model, embedding, rest, x, F, cameras[view], background=background, backdrop=backdrops[view]
             ).color
         )
-        return torch.stack([draw(motion.position[i], motion.deformation[i]) for i in frames.tolist()]).float()
+        return torch.stack([draw(motion.position[at[i]], motion.deformation[at[i]]) for i in frames.tolist()]).float()
 
     return Chain(simulate=simulate, render=render, clips=clips, prior=prior)

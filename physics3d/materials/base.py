@@ -6,19 +6,23 @@ H = F - I, so that float32 keeps small strains. The solver never asks which mode
 """
 
 import abc
+import re
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import torch
 import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from physics3d.materials.parameters import Values
+from physics3d.materials.parameters import Values, check_names, check_range
 
 
 @dataclass(frozen=True, kw_only=True)
 class AbstractMaterial(abc.ABC):
     """A constitutive model. Its fields choose the model; its parameters are the numbers that one learns."""
+
+    RANGES: ClassVar[dict[str, Any]] = {}  # parameter -> what it may be, SI; of further branches (_2, _3) likewise
 
     @property
     @abc.abstractmethod
@@ -42,9 +46,11 @@ class AbstractMaterial(abc.ABC):
         """
         return values
 
-    @abc.abstractmethod
     def check_parameters(self, values: Values) -> None:
         """Raise ValueError naming the parameter, its value and the remedy."""
+        check_names(values, self.parameters)
+        for name in self.parameters:
+            check_range(values[name], self.RANGES[re.sub(r"_[23]$", "", name)], name)
 
     @abc.abstractmethod
     def coefficients(self, values: Values) -> Float[Tensor, "k n"]:

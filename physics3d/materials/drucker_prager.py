@@ -11,14 +11,16 @@ elastic strain X = b_e - I lives in the memory, so that H is the total deformati
 import functools
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 import warp as wp
+from annotated_types import Gt, Lt
 from jaxtyping import Float
 from torch import Tensor
 
 from physics3d.materials.base import AbstractMaterial
-from physics3d.materials.parameters import Values, check_elastic, check_names, check_range, lame, rows
+from physics3d.materials.parameters import ELASTIC, Values, lame, rows
 from physics3d.materials.strain_memory import carried_strain, hencky_energy, store_strain
 from physics3d.materials.tensors import log_strain, scalars
 from physics3d.materials.tensors.replay import without_replay
@@ -28,6 +30,8 @@ from physics3d.warp_types import matrix
 @dataclass(frozen=True, kw_only=True)
 class DruckerPrager(AbstractMaterial):
     """Parameters: youngs_modulus [Pa], poissons_ratio, friction_angle [rad]."""
+
+    RANGES = ELASTIC | {"friction_angle": Annotated[float, Gt(0), Lt(math.pi / 2)]}
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -40,11 +44,6 @@ class DruckerPrager(AbstractMaterial):
     @property
     def memory_rows(self) -> int:
         return 7
-
-    def check_parameters(self, values: Values) -> None:
-        check_names(values, self.parameters)
-        check_elastic(values)
-        check_range(values, "friction_angle", 0.0, math.pi / 2)
 
     def coefficients(self, values: Values) -> Float[Tensor, "3 n"]:
         self.check_parameters(values)

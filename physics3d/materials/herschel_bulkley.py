@@ -22,13 +22,16 @@ they are. Dissipation q g >= 0. X = b_e - I is stored. Simo and Hughes, Computat
 import functools
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import warp as wp
+from annotated_types import Gt, Lt
 from jaxtyping import Float
 from torch import Tensor
 
+from physics3d.checks import Positive
 from physics3d.materials.base import AbstractMaterial
-from physics3d.materials.parameters import Values, check_elastic, check_names, check_range, lame, rows
+from physics3d.materials.parameters import ELASTIC, Values, lame, rows
 from physics3d.materials.strain_memory import carry_strain, hencky_energy, load_strain, store_strain
 from physics3d.materials.tensors import log_strain, scalars
 from physics3d.materials.tensors.replay import without_replay
@@ -39,6 +42,12 @@ from physics3d.warp_types import matrix
 class HerschelBulkley(AbstractMaterial):
     """Parameters: youngs_modulus [Pa], poissons_ratio, yield_stress tau_y [Pa] in shear, consistency k [Pa s^n],
     flow_index n (below 1: the faster, the thinner)."""
+
+    RANGES = ELASTIC | {
+        "yield_stress": Positive,
+        "consistency": Positive,
+        "flow_index": Annotated[float, Gt(0), Lt(2)],
+    }
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -57,13 +66,6 @@ class HerschelBulkley(AbstractMaterial):
     @property
     def memory_rows(self) -> int:
         return 6
-
-    def check_parameters(self, values: Values) -> None:
-        check_names(values, self.parameters)
-        check_elastic(values)
-        check_range(values, "yield_stress", 0.0)
-        check_range(values, "consistency", 0.0)
-        check_range(values, "flow_index", 0.0, 2.0)
 
     def coefficients(self, values: Values) -> Float[Tensor, "5 n"]:
         self.check_parameters(values)

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from physics3d.materials.base import AbstractMaterial
+from physics3d.warp_start import start_warp
 from physics3d.warp_types import matrix
 
 _REAL = {torch.float32: wp.float32, torch.float64: wp.float64}
@@ -39,14 +40,14 @@ def _kernel(function: wp.Function, real: type) -> wp.Kernel:
     def material_points(
         # in
         dt: real,  # [s]
-        L: wp.array(dtype=mat33),  # velocity gradient [1/s]
-        H: wp.array(dtype=mat33),  # deformation minus identity
-        coefficients: wp.array2d(dtype=real),
-        memory: wp.array2d(dtype=real),
+        L: wp.array(dtype=mat33),  # [n] velocity gradient [1/s]
+        H: wp.array(dtype=mat33),  # [n] deformation minus identity [1]
+        coefficients: wp.array2d(dtype=real),  # [k, n] of the material
+        memory: wp.array2d(dtype=real),  # [m, n] internal variables
         # out
-        H_next: wp.array(dtype=mat33),
-        tau: wp.array(dtype=mat33),  # Kirchhoff stress [Pa]
-        memory_next: wp.array2d(dtype=real),
+        H_next: wp.array(dtype=mat33),  # [n] [1]
+        tau: wp.array(dtype=mat33),  # [n] Kirchhoff stress [Pa]
+        memory_next: wp.array2d(dtype=real),  # [m, n]
     ):
         p = wp.tid()
         H_p, tau_p = function(p, dt, L[p], H[p], coefficients, memory, memory_next)
@@ -86,8 +87,7 @@ class _Outputs:
 class _Advance(torch.autograd.Function):
     @staticmethod
     def forward(ctx, material: AbstractMaterial, dt: float, L: Tensor, H: Tensor, coefficients: Tensor, memory: Tensor):
-        wp.config.quiet = True
-        wp.init()
+        start_warp()
         n, real = len(H), _REAL[H.dtype]
         L, H, columns, memory = (t.detach().contiguous() for t in (L, H, coefficients.expand(-1, n), memory))
         inputs = _Inputs(L=L, H=H, coefficients=columns, memory=memory)

@@ -14,8 +14,9 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
+from physics3d.checks import NotNegative, Positive
 from physics3d.materials.base import AbstractMaterial
-from physics3d.materials.parameters import Values, check_names, check_range, rows
+from physics3d.materials.parameters import Values, rows
 from physics3d.materials.tensors import volume
 from physics3d.materials.tensors.replay import without_replay
 from physics3d.warp_types import matrix
@@ -24,6 +25,8 @@ from physics3d.warp_types import matrix
 @dataclass(frozen=True, kw_only=True)
 class MooneyRivlin(AbstractMaterial):
     """Elastic; parameters first_modulus C_1, second_modulus C_2 and bulk_modulus K [Pa]."""
+
+    RANGES = {"first_modulus": Positive, "second_modulus": NotNegative, "bulk_modulus": Positive}
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -36,12 +39,6 @@ class MooneyRivlin(AbstractMaterial):
     @property
     def memory_rows(self) -> int:
         return 1
-
-    def check_parameters(self, values: Values) -> None:
-        check_names(values, self.parameters)
-        check_range(values, "first_modulus", 0.0)
-        check_range(values, "second_modulus", 0.0, closed=True)
-        check_range(values, "bulk_modulus", 0.0)
 
     def coefficients(self, values: Values) -> Float[Tensor, "3 n"]:
         self.check_parameters(values)

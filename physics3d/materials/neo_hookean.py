@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from physics3d.materials.base import AbstractMaterial
-from physics3d.materials.parameters import Values, check_elastic, check_names, lame, rows
+from physics3d.materials.parameters import ELASTIC, Values, lame, rows
 from physics3d.materials.tensors import scalars, volume
 from physics3d.materials.tensors.replay import without_replay
 from physics3d.warp_types import matrix
@@ -29,6 +29,8 @@ _FLOOR = 1e-4  # J
 @dataclass(frozen=True, kw_only=True)
 class NeoHookean(AbstractMaterial):
     """Elastic; parameters youngs_modulus [Pa] and poissons_ratio."""
+
+    RANGES = ELASTIC
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -41,10 +43,6 @@ class NeoHookean(AbstractMaterial):
     @property
     def memory_rows(self) -> int:
         return 1
-
-    def check_parameters(self, values: Values) -> None:
-        check_names(values, self.parameters)
-        check_elastic(values)
 
     def coefficients(self, values: Values) -> Float[Tensor, "2 n"]:
         self.check_parameters(values)

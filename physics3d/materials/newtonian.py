@@ -14,14 +14,17 @@ explicit step needs dt < rho dx^2 / (6 eta) besides the sound-speed limit. Bird,
 
 import functools
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 import warp as wp
+from annotated_types import Ge, Le
 from jaxtyping import Float
 from torch import Tensor
 
+from physics3d.checks import NotNegative, Positive
 from physics3d.materials.base import AbstractMaterial
-from physics3d.materials.parameters import Values, check_names, check_range, rows
+from physics3d.materials.parameters import Values, rows
 from physics3d.materials.tensors import volume
 from physics3d.materials.tensors.replay import without_replay
 from physics3d.warp_types import matrix
@@ -32,6 +35,8 @@ _LEAST_RATE = 1e-3  # g_0 [1/s]
 @dataclass(frozen=True, kw_only=True)
 class Newtonian(AbstractMaterial):
     """Parameters: bulk_modulus [Pa], viscosity k [Pa s^n], power_index n."""
+
+    RANGES = {"bulk_modulus": Positive, "viscosity": NotNegative, "power_index": Annotated[float, Ge(0), Le(2)]}
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -44,12 +49,6 @@ class Newtonian(AbstractMaterial):
     @property
     def memory_rows(self) -> int:
         return 1
-
-    def check_parameters(self, values: Values) -> None:
-        check_names(values, self.parameters)
-        check_range(values, "bulk_modulus", 0.0)
-        check_range(values, "viscosity", 0.0, closed=True)
-        check_range(values, "power_index", 0.0, 2.0, closed=True)
 
     def coefficients(self, values: Values) -> Float[Tensor, "3 n"]:
         self.check_parameters(values)

@@ -1,12 +1,15 @@
 """Physical parameters of a material: their names, their ranges, and the rows that a Warp function reads."""
 
-import math
 from collections.abc import Iterable
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from physics3d.checks import PoissonsRatio, Positive, complaint
+
+ELASTIC = {"youngs_modulus": Positive, "poissons_ratio": PoissonsRatio}
 Values = dict[str, Tensor]  # physical name -> scalar or one number per particle, SI
 
 _RENAMED = {"viscosity_time": "relaxation_time"}  # in names of parameters; old configurations and estimates have them
@@ -29,20 +32,13 @@ def check_names(values: Values, parameters: tuple[str, ...]) -> None:
         raise ValueError(f"material parameters: missing {sorted(missing)}, unknown {sorted(unknown)}; needed: {need}")
 
 
-def check_range(values: Values, name: str, lowest: float, highest: float = math.inf, *, closed: bool = False) -> None:
-    """Raise ValueError unless lowest < values[name] < highest (closed: <=); NaN never passes."""
-    value = torch.as_tensor(values[name]).detach()
-    good = (value >= lowest) & (value <= highest) if closed else (value > lowest) & (value < highest)
-    if not bool(good.all()):
-        worst = value[~good].flatten()[0].item()
-        less = "<=" if closed else "<"
-        raise ValueError(f"{name} is {worst:g}; take {lowest:g} {less} {name} {less} {highest:g}")
-
-
-def check_elastic(values: Values) -> None:
-    """Raise ValueError unless youngs_modulus [Pa] is positive and poissons_ratio lies in (-1, 0.5)."""
-    check_range(values, "youngs_modulus", 0.0)
-    check_range(values, "poissons_ratio", -1.0, 0.5)
+def check_range(value: Tensor, allowed: Any, name: str) -> None:
+    """Raise ValueError unless every number in `value` is what the hint `allowed` says; NaN never is."""
+    value = torch.as_tensor(value).detach()
+    for extreme in (value.amin(), value.amax()) if value.numel() else ():
+        wrong = complaint(allowed, float(extreme), name)
+        if wrong:
+            raise ValueError(wrong)
 
 
 def lame(youngs_modulus: Tensor, poissons_ratio: Tensor) -> tuple[Tensor, Tensor]:

@@ -15,14 +15,17 @@ X = b_e - I and ln J_P live in the memory, so that H is the total deformation.
 
 import functools
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 import warp as wp
+from annotated_types import Gt, Lt
 from jaxtyping import Float
 from torch import Tensor
 
+from physics3d.checks import NotNegative, Positive
 from physics3d.materials.base import AbstractMaterial
-from physics3d.materials.parameters import Values, check_elastic, check_names, check_range, lame, rows
+from physics3d.materials.parameters import ELASTIC, Values, lame, rows
 from physics3d.materials.strain_memory import carried_strain, hencky_energy, store_strain
 from physics3d.materials.tensors import return_maps, scalars
 from physics3d.materials.tensors.replay import without_replay
@@ -33,6 +36,12 @@ from physics3d.warp_types import matrix
 class Snow(AbstractMaterial):
     """Parameters: youngs_modulus [Pa], poissons_ratio, critical_compression theta_c, critical_stretch theta_s,
     hardening xi."""
+
+    RANGES = ELASTIC | {
+        "critical_compression": Annotated[float, Gt(0), Lt(1)],
+        "critical_stretch": Positive,
+        "hardening": NotNegative,
+    }
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -53,11 +62,7 @@ class Snow(AbstractMaterial):
         return 7
 
     def check_parameters(self, values: Values) -> None:
-        check_names(values, self.parameters)
-        check_elastic(values)
-        check_range(values, "critical_compression", 0.0, 1.0)
-        check_range(values, "critical_stretch", 0.0)
-        check_range(values, "hardening", 0.0, closed=True)
+        super().check_parameters(values)
         with torch.no_grad():
             mu, K, lower, upper, xi = self._rows(values)
             widest = torch.maximum(-lower, upper) ** 2 / -lower

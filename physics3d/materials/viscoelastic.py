@@ -25,23 +25,30 @@ Liu et al. (arXiv 2406.04338); where and why we depart from it: docs/method.md.
 
 import functools
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Annotated, Literal
 
 import torch
 import warp as wp
+from annotated_types import Ge, Le
 from jaxtyping import Float
 from torch import Tensor
 
+from physics3d.checks import MayBeInfinite, Positive, at_least_one, require_fields
 from physics3d.materials.base import AbstractMaterial
 from physics3d.materials.neo_hookean_branch import neo_hookean_branch
-from physics3d.materials.parameters import Values, check_elastic, check_names, check_range, lame, rows
+from physics3d.materials.parameters import ELASTIC, Values, lame, rows
 from physics3d.materials.strain_memory import carry_strain, load_strain, principal_log_strain, store_strain
 from physics3d.materials.tensors import decay, log_strain, polar, scalars, volume
 from physics3d.materials.tensors.replay import without_replay
 from physics3d.warp_types import matrix
 
-Spring = Literal["hencky", "neo_hookean"]
-Flow = Literal["log_strain", "stress"]
+RelaxationTime = Annotated[float, Ge(1e-30), MayBeInfinite()]  # [s]
+BRANCH = {
+    "branch_shear_modulus": Positive,
+    "branch_bulk_modulus": Positive,
+    "shear_relaxation_time": RelaxationTime,
+    "bulk_relaxation_time": RelaxationTime,
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,32 +62,27 @@ class Viscoelastic(AbstractMaterial):
     Raises ValueError for a number of branches outside 0..3, an unknown spring or flow, or nothing at all.
     """
 
-    branches: int = 1
+    branches: Annotated[int, Ge(0), Le(3)] = 1
     elastic: bool = True  # the branch that never relaxes
-    spring: Spring = "hencky"
-    flow: Flow = "log_strain"
+    spring: Literal["hencky", "neo_hookean"] = "hencky"
+    flow: Literal["log_strain", "stress"] = "log_strain"
+
+    RULES = (at_least_one("elastic", "branches"),)  # else no stress is defined
+    RANGES = ELASTIC | BRANCH
 
     def __post_init__(self) -> None:
-        if self.branches not in (0, 1, 2, 3):
-            raise ValueError(f"branches is {self.branches}; take 0, 1, 2 or 3")
-        for name, known in (("spring", get_args(Spring)), ("flow", get_args(Flow))):
-            if getattr(self, name) not in known:
-                raise ValueError(f"{name} is {getattr(self, name)!r}; take one of {known}")
-        if not self.elastic and not self.branches:
-            raise ValueError(
-                "elastic is False and branches is 0: no stress is defined; take branches >= 1 or elastic=True"
-            )
+        require_fields(self, type(self).__name__)
 
     @property
     def parameters(self) -> tuple[str, ...]:
         names = ("youngs_modulus", "poissons_ratio") if self.elastic else ()
-        return names + tuple(name + suffix for suffix in self._suffixes for name in _BRANCH)
+        return names + tuple(name + suffix for suffix in self._suffixes for name in BRANCH)
 
     @property
     def example(self) -> dict[str, float]:
         found = {"youngs_modulus": 1e5, "poissons_ratio": 0.3} if self.elastic else {}  # soft tissue
         for i, suffix in enumerate(self._suffixes):
-            found |= dict(zip((name + suffix for name in _BRANCH), (4e4, 8e4, 0.2 / 4**i, 0.5 / 4**i), strict=True))
+            found |= dict(zip((name + suffix for name in BRANCH), (4e4, 8e4, 0.2 / 4**i, 0.5 / 4**i), strict=True))
         return found
 
     @property
@@ -91,21 +93,11 @@ class Viscoelastic(AbstractMaterial):
     def memory_rows(self) -> int:
         return self._first_memory + 7 * self.branches
 
-    def check_parameters(self, values: Values) -> None:
-        check_names(values, self.parameters)
-        if self.elastic:
-            check_elastic(values)
-        for suffix in self._suffixes:
-            for name in ("branch_shear_modulus", "branch_bulk_modulus"):
-                check_range(values, name + suffix, 0.0)
-            for name in ("shear_relaxation_time", "bulk_relaxation_time"):
-                check_range(values, name + suffix, 1e-30, closed=True)
-
     def coefficients(self, values: Values) -> Float[Tensor, "k n"]:
         self.check_parameters(values)
         found = list(lame(values["youngs_modulus"], values["poissons_ratio"])) if self.elastic else []
         for suffix in self._suffixes:
-            mu, K, shear_time, bulk_time = (values[name + suffix] for name in _BRANCH)
+            mu, K, shear_time, bulk_time = (values[name + suffix] for name in BRANCH)
             found += [mu, K, 1 / shear_time, 1 / bulk_time]
         return rows(*found)
 
@@ -148,17 +140,6 @@ class Viscoelastic(AbstractMaterial):
 
     def advance(self, real: type) -> wp.Function:
         return _advance(self.branches, self.elastic, self.spring, self.flow, real)
-
-
-_BRANCH = ("branch_shear_modulus", "branch_bulk_modulus", "shear_relaxation_time", "bulk_relaxation_time")
-
-
-def _grown(x: Tensor) -> Tensor:
-    """1/g = (e^x - 1)/x (`tensors.decay`)."""
-    return torch.where(x > 0, torch.expm1(x) / x.clamp(min=1e-30), 1.0)
-
-
-_NEAR = 1.0  # relaxation times: after a longer step the strain is stored as it is, after a shorter one ahead
 
 
 @functools.cache

@@ -15,8 +15,9 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
+from physics3d.checks import NotNegative, Positive
 from physics3d.materials.base import AbstractMaterial
-from physics3d.materials.parameters import Values, check_elastic, check_names, check_range, lame, rows
+from physics3d.materials.parameters import ELASTIC, Values, lame, rows
 from physics3d.materials.strain_memory import carried_strain, hencky_energy, store_strain
 from physics3d.materials.tensors import log_strain, scalars
 from physics3d.materials.tensors.replay import without_replay
@@ -26,6 +27,8 @@ from physics3d.warp_types import matrix
 @dataclass(frozen=True, kw_only=True)
 class VonMises(AbstractMaterial):
     """Parameters: youngs_modulus [Pa], poissons_ratio, yield_stress [Pa] in tension, hardening_modulus [Pa]."""
+
+    RANGES = ELASTIC | {"yield_stress": Positive, "hardening_modulus": NotNegative}
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -38,12 +41,6 @@ class VonMises(AbstractMaterial):
     @property
     def memory_rows(self) -> int:
         return 7
-
-    def check_parameters(self, values: Values) -> None:
-        check_names(values, self.parameters)
-        check_elastic(values)
-        check_range(values, "yield_stress", 0.0)
-        check_range(values, "hardening_modulus", 0.0, closed=True)
 
     def coefficients(self, values: Values) -> Float[Tensor, "4 n"]:
         self.check_parameters(values)

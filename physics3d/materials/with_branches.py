@@ -8,16 +8,19 @@ itself, it costs nothing. Reese and Govindjee (1998) for the split of the stress
 
 import functools
 from dataclasses import dataclass, field
+from typing import Annotated, Literal
 
 import warp as wp
+from annotated_types import Ge, Le
 from jaxtyping import Float
 from torch import Tensor
 
+from physics3d.checks import require_fields
 from physics3d.materials.base import AbstractMaterial, coefficient_rows
 from physics3d.materials.neo_hookean import NeoHookean
 from physics3d.materials.parameters import Values, check_names, rows
 from physics3d.materials.tensors.replay import without_replay
-from physics3d.materials.viscoelastic import Flow, Spring, Viscoelastic, maxwell_branches
+from physics3d.materials.viscoelastic import BRANCH, Viscoelastic, maxwell_branches
 from physics3d.warp_types import matrix
 
 
@@ -29,13 +32,14 @@ class WithBranches(AbstractMaterial):
     """
 
     solid: AbstractMaterial = field(default_factory=NeoHookean)
-    branches: int = 1
-    spring: Spring = "hencky"
-    flow: Flow = "log_strain"
+    branches: Annotated[int, Ge(1), Le(3)] = 1
+    spring: Literal["hencky", "neo_hookean"] = "hencky"
+    flow: Literal["log_strain", "stress"] = "log_strain"
+
+    RANGES = BRANCH  # and those of the solid
 
     def __post_init__(self) -> None:
-        if self.branches not in (1, 2, 3):
-            raise ValueError(f"branches is {self.branches}; take 1, 2 or 3, or the solid alone")
+        require_fields(self, type(self).__name__)
         twice = set(self.solid.parameters) & set(self._maxwell.parameters)
         if twice:
             raise ValueError(f"the solid has {sorted(twice)} already; give it more branches of its own instead")

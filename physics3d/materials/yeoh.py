@@ -9,14 +9,17 @@ itself; y is kept in the memory for the limit of explicit steps, which stiffenin
 
 import functools
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 import warp as wp
+from annotated_types import Ge
 from jaxtyping import Float
 from torch import Tensor
 
+from physics3d.checks import LARGEST, NotNegative, Positive
 from physics3d.materials.base import AbstractMaterial
-from physics3d.materials.parameters import Values, check_names, check_range, rows
+from physics3d.materials.parameters import Values, rows
 from physics3d.materials.tensors import volume
 from physics3d.materials.tensors.replay import without_replay
 from physics3d.warp_types import matrix
@@ -25,6 +28,13 @@ from physics3d.warp_types import matrix
 @dataclass(frozen=True, kw_only=True)
 class Yeoh(AbstractMaterial):
     """Elastic; parameters linear_modulus C_1, quadratic_coefficient C_2, cubic_modulus C_3 and bulk_modulus K [Pa]."""
+
+    RANGES = {
+        "linear_modulus": Positive,
+        "quadratic_coefficient": Annotated[float, Ge(-LARGEST)],
+        "cubic_modulus": NotNegative,
+        "bulk_modulus": Positive,
+    }
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -39,13 +49,10 @@ class Yeoh(AbstractMaterial):
         return 2
 
     def check_parameters(self, values: Values) -> None:
-        check_names(values, self.parameters)
-        check_range(values, "linear_modulus", 0.0)
-        check_range(values, "cubic_modulus", 0.0, closed=True)
-        check_range(values, "bulk_modulus", 0.0)
+        super().check_parameters(values)
         first, second, third = (torch.as_tensor(values[name]).detach() for name in self.parameters[:3])
         least = -torch.sqrt(3 * first * third)  # of C_2: no real root of C_1 + 2 C_2 y + 3 C_3 y^2
-        if not bool((second >= least).all()):  # NaN never passes
+        if not bool((second >= least).all()):
             raise ValueError(
                 f"quadratic_coefficient is {second.min():g}: the rubber would lose its stiffness; take at least "
                 f"-(3 linear_modulus cubic_modulus)^(1/2) = {least.max():g}"

@@ -13,9 +13,9 @@ from physics3d.boundaries.base import AbstractBoundary, Setting
 from physics3d.log import Log
 from physics3d.mpm.frames import Frames
 from physics3d.mpm.problem import Problem, check_inputs, region, sorted_by_cell
-from physics3d.mpm.substep import start_warp
 from physics3d.mpm.velocity_gradient import velocity_gradient
 from physics3d.trajectory import Trajectory
+from physics3d.warp_start import start_warp
 from physics3d.world import World
 
 

@@ -37,17 +37,7 @@ from physics3d.mpm.threads import Wait, on_all, shares
 from physics3d.mpm.update import update
 from physics3d.warp_types import vector4
 
-_MULTIPLY_ADD = "-ffp-contract=fast"  # one rounding for a b + c where the processor can, on the CPU as on CUDA
 Launches = dict[str, wp.Launch]  # by the name of the kernel in the table above
-
-
-def start_warp() -> None:
-    """Start Warp without its banner; before anything else of Warp is touched."""
-    wp.config.log_level = wp.LOG_WARNING
-    flags = wp.config.cpu_compiler_flags or ""
-    if _MULTIPLY_ADD not in flags:
-        wp.config.cpu_compiler_flags = f"{flags} {_MULTIPLY_ADD}".strip()
-    wp.init()
 
 
 class Substeps:

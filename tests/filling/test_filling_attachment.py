@@ -11,7 +11,11 @@ from physics3d.boundaries.impulse import Impulse
 from physics3d.log import Log
 from physics3d.materials.neo_hookean import NeoHookean
 from physics3d.mpm.rollout import rollout
+from physics3d.scenes.base import Capture
+from physics3d.segmentation import Segmentation
 from physics3d.world import World
+from stages.fill import Fill
+from stages.simulate import Simulate
 
 
 @pytest.fixture
@@ -40,15 +44,14 @@ def test_a_body_is_held_where_it_touches_what_is_static(speck, rng):
     assert float(at[:, 2].max()) < SPACING
     assert filled(gaussians, label=label).attached is None
     alone = filled(gaussians.select(label > 0), attach=True)
-    assert not bool(alone.attached.any()) and alone.held(()) == ()
+    assert not bool(alone.attached.any()) and alone.held == ()
 
 
 def test_held_particles_do_what_a_box_written_by_hand_does(rng):
     gaussians, label = stem_on_a_plate(rng)
     body = filled(gaussians, label=label, attach=True)
-    (found,) = body.held(())
+    (found,) = body.held
     box = FixedRegion(lower=(-1, -1, -1), upper=(1, 1, 0.001))
-    assert body.held((box,)) == ()
     world = World(
         material=NeoHookean(),
         density=300.0,
@@ -66,3 +69,38 @@ def test_held_particles_do_what_a_box_written_by_hand_does(rng):
     # the found ones reach up to three quarters of a spacing above the plate, of a stem of 23 spacings
     assert float((moved[0] - moved[1]).norm() / by_hand) < 0.15
     assert float((moved[2] - moved[1]).norm() / by_hand) > 1
+
+
+@pytest.mark.parametrize("attach", ["auto", "none"])
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_what_fill_says_is_held_is_what_does_not_move(attach, elsewhere, rng, tmp_path):
+    """... through the stages, whatever else the scene holds: a region beside the body changes nothing."""
+    gaussians, label = stem_on_a_plate(rng)
+    capture = Capture(name="stem", images=(), cameras=(), names=(), gaussians=gaussians)
+    segmentation = Segmentation(label=label, parts=("stem",), masks=None, mask_views=())
+    log = Log(tmp_path / "fill", quiet=True)
+    body = Fill(spacing=SPACING, attach=attach)(capture, gaussians, segmentation, log=log)
+    region = FixedRegion(lower=(0.5, 0.5, 0.5), upper=(0.6, 0.6, 0.6))
+    world = World(
+        material=NeoHookean(),
+        density=300.0,
+        start={"youngs_modulus": 1e5, "poissons_ratio": 0.3},
+        dx=2 * SPACING,
+        gravity=(0.0, 0.0, 0.0),
+        boundaries=(region,) if elsewhere else (),
+    )
+    poke = Impulse(force=(0.06, 0.03, 0), centre=(0, 0, 0.13), radius=0.03, duration=0.1)
+    stage = Simulate(world=world, frames=6, fps=25.0, excitation=(poke,))
+    run = stage(body, world.estimate(), log=Log(tmp_path / "simulate", quiet=True))
+    moved = (run.position[-1] - run.position[0]).norm(dim=1)
+    said = [(tmp_path / name / "log.txt").read_text() for name in ("fill", "simulate")]
+    if attach == "none":
+        assert body.attached is None and "attached at" not in said[0] and "nothing holds the body still" in said[1]
+        assert float(moved.min()) > 1e-3
+        return
+    count = int(body.attached.sum())
+    assert f"{count} particles beside static Gaussians are held there" in said[0]
+    assert f"held: {count} particles where it touches what is static" in said[1]
+    # nodes that get three tenths of their mass from held particles stand still; the others give a little
+    assert float(moved[body.attached].max()) < 0.03 * float(moved.max())
+    assert float(moved[~body.attached].max()) > 1e-3

@@ -54,3 +54,13 @@ def test_nonsense_is_refused_with_a_remedy(rng):
         filled(gaussians, label=(torch.arange(1000) < 3).to(torch.int32))
     with pytest.raises(ValueError, match=r"fill.isolated is 'burn'; take one of attach"):
         filled(gaussians, isolated="burn")
+
+
+@pytest.mark.parametrize(("radius", "spacing"), [(0.05, 5.0), (0.001, 0.01)])
+def test_a_body_smaller_than_a_cell_is_refused(radius, spacing, rng):
+    gaussians = discs(*sphere(1000, radius, rng), rng, sigma=radius / 20, thickness=radius / 100)
+    # a cell is two spacings
+    with pytest.raises(
+        ValueError, match=rf"fill.spacing is {spacing:g} m, and the body .* smaller than a cell .* take"
+    ):
+        filled(gaussians, spacing=spacing)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from analytic_bodies import discs, joined, sphere
+from analytic_bodies import box, discs, joined, sphere
 from seen_bodies import RADIUS, SPACING, Round, around, ball, filled, radius_in_pictures
 
 from physics3d.filling.seen import seen
@@ -91,3 +91,51 @@ def test_distances_are_those_of_the_surface(rng):
     assert abs(error[found].mean()) < 1.2e-3 and np.quantile(np.abs(error[found]), 0.9) < 1.6e-3
     assert ((normal * moved).sum(1)[found] > 0.9 * truth).mean() > 0.98  # outward, to 25 degrees
     assert view.beside(1.2 * x).all() and not view.beside(0.9 * x).any()
+
+
+# [spacings] standard deviation of Gaussians across their disc; fits of plain surfaces have them as broad as particles
+BREADTHS = [0.3, 1.0, 1.5, 2.0]
+
+
+@pytest.mark.parametrize("seen_by", ["cameras", "nobody"])
+@pytest.mark.parametrize("breadth", BREADTHS)
+def test_a_sheet_of_broad_gaussians_has_its_area(breadth, seen_by, rng):
+    sides, sigma = np.array([0.18, 0.12]), breadth * SPACING
+    point = rng.uniform([*(-sides / 2), 0], [*(sides / 2), 0], (1500, 3))
+    gaussians = discs(point, np.tile([0.0, 0.0, 1.0], (1500, 1)), rng, sigma=sigma)
+    body = filled(gaussians, around(16) if seen_by == "cameras" else ())
+    # random packing scatters by a tenth; discs at the rim reach one deviation over it, and no farther
+    least, most = 0.85 * sides.prod() / SPACING**2, 1.1 * (sides + 2 * sigma).prod() / SPACING**2
+    assert least < len(body.position) < most
+    assert float(body.position[:, 2].abs().max()) < 1e-3
+
+
+@pytest.mark.parametrize("breadth", BREADTHS)
+def test_a_ball_of_broad_gaussians_has_its_volume(breadth, rng):
+    """By itself it is the ball on which discs lie; with cameras it is what they see, which broad discs enlarge."""
+    point, normal = sphere(3000, RADIUS, rng)
+    gaussians, cameras = discs(point, normal, rng, sigma=breadth * SPACING), around(16)
+    radius = lambda body: (float(body.volume.double().sum()) * 3 / (4 * np.pi)) ** (1 / 3)
+    # the rim of a disc lies sigma^2/2R outside of the ball
+    assert RADIUS - 3e-4 < radius(filled(gaussians, ())) < RADIUS + (breadth * SPACING) ** 2 / (2 * RADIUS) + 3e-4
+    # three quarters of a pixel, as for small ones
+    assert radius(filled(gaussians, cameras)) == pytest.approx(radius_in_pictures(gaussians, cameras), abs=1.2e-3)
+
+
+@pytest.mark.parametrize("breadth", BREADTHS)
+def test_a_box_of_broad_gaussians_has_its_volume(breadth, rng):
+    """Its discs lie in its faces, however broad: what is seen of them is the face, not their centres."""
+    half, sigma = np.array([0.05, 0.04, 0.03]), breadth * SPACING
+    gaussians = discs(*box(4000, half, rng), rng, sigma=sigma)
+    for cameras in ((), around(16)):
+        volume = float(filled(gaussians, cameras).volume.double().sum()) / (8 * half.prod())
+        # faces reach one deviation over their edges, and a tenth of that ridge is filled
+        assert 0.95 < volume < 1.06 + 0.1 * ((half + sigma).prod() / half.prod() - 1)
+
+
+def test_gaussians_too_round_for_the_particles_are_refused_for_that(rng):
+    """A flat cloud of balls as thick as it is wide in particles: not the cameras are wrong."""
+    point = rng.uniform([-0.09, -0.06, 0], [0.09, 0.06, 0], (1500, 3))
+    gaussians = discs(point, np.tile([0.0, 0.0, 1.0], (1500, 1)), rng, sigma=2 * SPACING, thickness=2 * SPACING)
+    with pytest.raises(ValueError, match=r"24 mm thick, and its particles 6 mm apart.* larger scene.spacing"):
+        filled(gaussians, around(16))

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from small_scene import DAMPED, bar, cameras, capture, learner
+from small_scene import DAMPED, bar, bar_chain, cameras, capture, world
 
 from physics3d.gaussians.carry import carry
 from physics3d.gaussians.sh import sh_color
@@ -47,9 +47,9 @@ NAMES = ("youngs_modulus", "branch_shear_modulus", "shear_relaxation_time", "poi
 def poked():
     """A clip of six frames, and a chain whose material is not the one that was filmed; simulation in float64."""
     clip = capture(DAMPED, frames=6)
-    stage = learner(DAMPED | {"youngs_modulus": 1.5e4}, NAMES, precision="float64", frames=6)
-    field = GlobalField(start=stage.world.estimate().parameters, learn=NAMES, velocity_scale=1.0)
-    return field, stage.chain(clip, *bar(), clip.takes[0], field, torch.arange(6))
+    softer = world(DAMPED | {"youngs_modulus": 1.5e4}, precision="float64")
+    field = GlobalField(start=softer.estimate().parameters, learn=NAMES, velocity_scale=1.0)
+    return field, bar_chain(softer, field, clip, 6)
 
 
 def loss(chain: Chain, theta: torch.Tensor) -> torch.Tensor:

@@ -11,7 +11,8 @@ from physics3d.boundaries.impulse import Impulse
 from physics3d.materials.viscoelastic import Viscoelastic
 from physics3d.mpm.arrays import Arrays
 from physics3d.mpm.hooks import hooks_of
-from physics3d.mpm.substep import Substeps, start_warp
+from physics3d.mpm.substep import Substeps
+from physics3d.warp_start import start_warp
 
 DX, STEPS = 0.1, 5
 

@@ -7,6 +7,7 @@ import warp as wp
 
 from physics3d.mpm import transfer
 from physics3d.mpm.velocity_gradient import velocity_gradient
+from physics3d.warp_start import start_warp
 from physics3d.warp_types import matrix, vector, vector4
 
 DX, DT, SIDE, N = 0.1, 1e-3, 9, 40
@@ -58,7 +59,7 @@ def window():
 
 def scatter(p, adjoint=None, fast=False):
     """grid [node, 4], lost; or with the adjoint of the grid: adjoints of u, v, L, tau."""
-    wp.init()
+    start_warp()
     real = wp.float64 if p["u"].dtype == torch.float64 else wp.float32
     vec3, vec4, mat33 = vector(real), vector4(real), matrix(real)
     grid, lost = wp.zeros(SIDE**3, dtype=vec4, device="cpu"), wp.zeros(1, dtype=int, device="cpu")
@@ -78,7 +79,7 @@ def scatter(p, adjoint=None, fast=False):
 
 def gather(p, node_velocity, adjoint=None, fast=False):
     """v [p, 3], L [p, 3, 3]; or with their adjoints: adjoints of u and of the node velocities."""
-    wp.init()
+    start_warp()
     real = wp.float64
     vec3, mat33 = vector(real), matrix(real)
     inputs = [0, DX, window(), array(p["cell"], wp.vec3i), array(p["offset"], vec3), array(p["u"], vec3)]

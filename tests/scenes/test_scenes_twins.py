@@ -47,6 +47,11 @@ def test_a_twin_has_two_different_takes_from_the_same_rest(twin):
     assert (learn.videos[0][-1] != learn.videos[0][0]).any()
 
 
+def test_a_twin_announces_what_it_will_be(twin):
+    source, capture = twin
+    assert source.outline == capture.outline
+
+
 def test_the_truth_is_what_the_reference_world_uses(twin):
     source, capture = twin
     assert set(capture.truth) == set(Viscoelastic().parameters)

@@ -67,6 +67,24 @@ def test_initial_velocity_of_the_estimate_is_used(body):
     torch.testing.assert_close(x[-1], expected, atol=1e-6, rtol=0)
 
 
+@pytest.mark.parametrize("dx, word", [(0.3, r"smaller than a cell; take dx <= 0\.013 m"), (0.19, None)])
+def test_a_body_smaller_than_a_cell_is_refused(body, dx, word):
+    """0.2 m wide: 4 particles, 0.05 m apart. A fifteenth of that is 0.0133 m."""
+    run = lambda: Simulate(world=replace(WORLD, dx=dx), frames=2, fps=100.0)(body, WORLD.estimate(), log=Log(None))
+    if word is None:
+        run()
+    else:
+        with pytest.raises(ValueError, match=word):
+            run()
+
+
+def test_a_force_that_nothing_takes_is_refused(body):
+    shake = Impulse(acceleration_of_each=(1.0, 0.0, 0.0), nearest=3, centre=(0.0, 0.0, 0.0), duration=0.1)
+    stage = Simulate(world=WORLD, frames=2, fps=100.0, excitation=(shake,), force={"x": 1.0, "y": 0.0, "z": 0.0})
+    with pytest.raises(ValueError, match=r"simulate\.force is .* no impulse .* could replace"):
+        stage(body, WORLD.estimate(), log=Log(None))
+
+
 @pytest.mark.parametrize("fps", [0.0, -1.0, float("nan"), float("inf")])
 def test_senseless_fps_is_refused(body, fps):
     with pytest.raises(ValueError, match=r"simulate\.fps is"):

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from physics3d.checks import Count, Factor, NotNegative
 from physics3d.gaussians.adam import Moments
 from physics3d.gaussians.densification.base import AbstractDensification, require_some
 from physics3d.gaussians.model import Gaussians
@@ -20,9 +21,9 @@ from physics3d.gaussians.model import Gaussians
 
 @dataclass(frozen=True, kw_only=True)
 class Adaptive(AbstractDensification):
-    every: int = 100
-    faded: float = 0.02  # opacity below which a Gaussian is removed
-    opacity_weight: float = 0.01  # of the mean opacity, in the loss
+    every: Count = 100
+    faded: Factor = 0.02  # opacity below which a Gaussian is removed
+    opacity_weight: NotNegative = 0.01  # of the mean opacity, in the loss
 
     def penalty(self, model: Gaussians, extent: float) -> Float[Tensor, ""]:
         return self.opacity_weight * model.opacity.mean()

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from physics3d.checks import require_fields
 from physics3d.gaussians.adam import Moments
 from physics3d.gaussians.model import Gaussians
 
@@ -14,6 +15,10 @@ class AbstractDensification:
     """A frozen dataclass with `every`: iterations between two calls of `renewed`."""
 
     every: int
+
+    def check(self) -> None:
+        """Raise ValueError naming field, value and remedy."""
+        require_fields(self, "densification")
 
     def renewed(
         self, model: Gaussians, moments: Moments, error: Callable[[], Tensor], wanted: int, generator: torch.Generator

@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from physics3d.checks import Count, Factor, NotNegative
 from physics3d.gaussians.adam import Moments
 from physics3d.gaussians.densification.base import AbstractDensification, require_some
 from physics3d.gaussians.model import Gaussians
@@ -25,11 +26,11 @@ MOST_COPIES = 50  # N above which the scale is not corrected any further
 
 @dataclass(frozen=True, kw_only=True)
 class Relocation(AbstractDensification):
-    every: int = 100
-    faded: float = 0.005  # opacity below which a Gaussian moves elsewhere
-    opacity_weight: float = 0.01  # of the mean opacity, in the loss
-    scale_weight: float = 0.03  # of the mean scale over the extent of the scene, in the loss
-    noise: float = 8e4  # of the random steps: sigma = noise * step size * Sigma / extent
+    every: Count = 100
+    faded: Factor = 0.005  # opacity below which a Gaussian moves elsewhere
+    opacity_weight: NotNegative = 0.01  # of the mean opacity, in the loss
+    scale_weight: NotNegative = 0.03  # of the mean scale over the extent of the scene, in the loss
+    noise: NotNegative = 8e4  # of the random steps: sigma = noise * step size * Sigma / extent
 
     def penalty(self, model: Gaussians, extent: float) -> Float[Tensor, ""]:
         return (

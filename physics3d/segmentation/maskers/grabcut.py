@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from physics3d.checks import Count
 from physics3d.segmentation.maskers.base import AbstractMasker
 from physics3d.segmentation.outline import outlined
 from physics3d.segmentation.pixels import bounds, centres, thinned
@@ -19,8 +20,8 @@ UNLIKE = 15.0  # Lab units to the nearest sample: what is in the box and farther
 class GrabCut(AbstractMasker):
     """Colour models of object and surroundings, separated by a minimum cut: OpenCV's, or near a guess our `outline`."""
 
-    iterations: int = 5
-    most_points: int = 400
+    iterations: Count = 5
+    most_points: Count = 400
 
     def __call__(self, image, *, box, positive, negative):
         import cv2

@@ -4,12 +4,14 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+from annotated_types import MultipleOf
 from jaxtyping import Float
 
+from physics3d.checks import Count, Device, Pixels, Text
 from physics3d.priors.weights import hub_answers
 from physics3d.segmentation.maskers.base import AbstractMasker, AbstractVideoMasker
 from physics3d.segmentation.pixels import bounds, centres, eroded, thinned
@@ -21,11 +23,15 @@ SURE = 0.95  # share of a pixel above which it is the object's, and 1 - SURE bel
 class Sam2(AbstractMasker):
     """SAM 2's image predictor. `weights`: a .pt file, or the name of a repository of facebook/sam2* on the hub."""
 
-    config: str = "sam2.1/sam2.1_hiera_t"  # a .yaml below the package's `configs`
-    weights: str = "facebook/sam2.1-hiera-tiny"
-    image_size: int = 1024  # side of the square the network sees [px]
-    most_points: int = 8
-    device: str = "cpu"
+    config: Text = "sam2.1/sam2.1_hiera_t"  # a .yaml below the package's `configs`
+    weights: Text = "facebook/sam2.1-hiera-tiny"
+    image_size: Annotated[Pixels, MultipleOf(32)] = 1024  # side of the square the network sees [px]
+    most_points: Count = 8
+    device: Device = "cpu"
+
+    def files(self) -> tuple[str, ...]:
+        """The weights, fetched if they are not on this machine: part of the fingerprint of the segmentation."""
+        return (str(sam2_weights(self.weights)),)
 
     def __call__(self, image, *, box, positive, negative):
         return self._predict(image, box, positive, negative, None)
@@ -66,13 +72,13 @@ class Sam2(AbstractMasker):
 
     @cached_property
     def model(self) -> Any:
-        """The network of both predictors. Raises ValueError naming segment.masker.config or segment.masker.weights."""
+        """The network of both predictors. Raises ValueError naming masker.config or masker.weights."""
         model = build_sam2(self.config, self.image_size)
         state = torch.load(sam2_weights(self.weights), map_location="cpu", weights_only=True)
         missing, unexpected = model.load_state_dict(state.get("model", state), strict=False)
         if missing or unexpected:
             raise ValueError(
-                f"segment.masker.weights={self.weights} does not fit segment.masker.config={self.config} "
+                f"masker.weights={self.weights} does not fit masker.config={self.config} "
                 f"({len(missing)} entries missing, {len(unexpected)} unexpected); choose the pair of one model"
             )
         return model.to(self.device).eval()
@@ -107,7 +113,10 @@ class Sam2Video(AbstractVideoMasker):
 
         with TemporaryDirectory() as folder:  # it reads frames from files only
             for i, image in enumerate(images):
-                cv2.imwrite(f"{folder}/{i}.jpg", image[..., ::-1], (cv2.IMWRITE_JPEG_QUALITY, 97))
+                if not cv2.imwrite(f"{folder}/{i}.jpg", image[..., ::-1], (cv2.IMWRITE_JPEG_QUALITY, 97)):
+                    raise OSError(
+                        f"cannot write photographs for SAM 2 to {folder}; is the disk full? (TMPDIR=<folder>)"
+                    )
             state = self.still.model.init_state(folder)
         self.still.model.add_new_mask(state, start, 1, mask)
         found: dict[int, np.ndarray] = {}
@@ -135,11 +144,9 @@ def build_sam2(config: str, image_size: int) -> torch.nn.Module:
     file = folder / f"{config}.yaml"
     if not file.is_file():
         known = sorted(str(f.relative_to(folder).with_suffix("")) for f in folder.glob("sam2*/sam2*_hiera_?*.yaml"))
-        raise ValueError(
-            f"segment.masker.config={config} is none of {', '.join(k for k in known if 'training' not in k)}"
-        )
+        raise ValueError(f"masker.config={config} is none of {', '.join(k for k in known if 'training' not in k)}")
     if image_size % 32 or image_size <= 0:
-        raise ValueError(f"segment.masker.image_size={image_size} must be a positive multiple of 32, 1024 as trained")
+        raise ValueError(f"masker.image_size={image_size} must be a positive multiple of 32, 1024 as trained")
     tree = OmegaConf.load(file)
     tree.model.image_size = image_size
     # a subclass that adds nothing to the network: it serves the image predictor as well
@@ -157,7 +164,7 @@ def sam2_weights(name: str) -> Path:
 
     stored = f"{name.rpartition('/')[2].replace('-', '_')}.pt"
     remedy = (
-        f"segment.masker.weights={name} is neither a file, nor in the hub's cache, nor can it be fetched; set it to a "
+        f"masker.weights={name} is neither a file, nor in the hub's cache, nor can it be fetched; set it to a "
         "downloaded sam2*.pt, or choose physics3d.segmentation.maskers.grabcut.GrabCut, which needs no weights"
     )
     try:
