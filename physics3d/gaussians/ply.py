@@ -124,8 +124,8 @@ def _log_scale(scale: np.ndarray, mean: np.ndarray, as_is: bool, path: Path, sai
     from scipy.spatial import cKDTree
 
     if scale.min() >= 0 and scale.max() > 0 and len(mean) > 1:
-        # ln of sizes above one unit, or sizes? whichever is nearer to the distance of neighbours, by a factor of three in
-        # favour of sizes where opacity was stored as it is
+        # ln of sizes above one unit, or sizes? whichever is nearer to the distance of neighbours, by a factor of
+        # three in favour of sizes where opacity was stored as it is
         spacing = np.median(cKDTree(mean).query(mean, k=2)[0][:, 1])
         widest = np.median(scale.max(1))
         favour = np.log(3.0) if as_is else 0.0

@@ -1,7 +1,7 @@
 """COLMAP: photographs in <path>/images and a model in <path>/sparse/0, or <path>/sparse as its undistorter writes it.
 
-Pictures of lenses with distortion (SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV) are undistorted as they are read. Fisheye
-and panoramic cameras are no perspective cameras and refused.
+Pictures of lenses with distortion (SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV) are undistorted as they are read.
+Fisheye and panoramic cameras are no perspective cameras and refused.
 """
 
 import fnmatch
@@ -20,7 +20,7 @@ from physics3d.scenes.colmap_model import PERSPECTIVE, ColmapCamera, ColmapImage
 from physics3d.scenes.lens import Lens
 from physics3d.scenes.named import find, present, require_unique
 from physics3d.scenes.photographs import require_folder
-from physics3d.scenes.posed import AbstractPosedSource, Points, Posed
+from physics3d.scenes.posed import AbstractPosedSource, Points, Posed, fixed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,12 +44,11 @@ class ColmapSource(AbstractPosedSource):
                     f"{path}: its camera {image.camera} is not in {model.files[0]}; the model is incomplete"
                 )
             camera = model.cameras[image.camera]
-            lens = _lens(camera, path)
             posed.append(
                 Posed(
                     path=path,
                     name=image.name,
-                    lens=lambda width, height, lens=lens: lens,
+                    lens=fixed(_lens(camera, path)),
                     size=(camera.width, camera.height),
                     world_to_camera=_pose(image, path),
                 )

@@ -71,8 +71,8 @@ def read_model(root: Path) -> ColmapModel:
             if all(f.is_file() for f in files):
                 return reader(files)
     raise ValueError(
-        f"no COLMAP model in {root / 'sparse' / '0'} or {root / 'sparse'}: it needs cameras, images and points3D, all as "
-        ".bin or all as .txt; check the path in the scene's configuration (DATA=... on the command line)"
+        f"no COLMAP model in {root / 'sparse' / '0'} or {root / 'sparse'}: it needs cameras, images and points3D, all "
+        "as .bin or all as .txt; check the path in the scene's configuration (DATA=... on the command line)"
     )
 
 
@@ -80,7 +80,7 @@ def _read_text(files: tuple[Path, ...]) -> ColmapModel:
     model = ColmapModel(files)
     file, number = files[0], 0
     try:
-        for number, line in _lines(file):
+        for number, line in _lines(file):  # noqa: B007 the error below names the line
             w = line.split()
             if w[1] in PERSPECTIVE and len(w) != 4 + len(PERSPECTIVE[w[1]]):
                 raise ValueError(f"{w[1]} has {len(PERSPECTIVE[w[1]])} parameters, here are {len(w) - 4}")
@@ -101,7 +101,7 @@ def _read_text(files: tuple[Path, ...]) -> ColmapModel:
                 )
         file, number = files[2], 0
         xyz, rgb, index, seen = [], [], [], []
-        for i, (number, line) in enumerate(_lines(file)):
+        for i, (number, line) in enumerate(_lines(file)):  # noqa: B007
             w = line.split()
             if len(w) < 8 or len(w) % 2:
                 raise ValueError("the line is cut short")

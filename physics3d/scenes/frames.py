@@ -1,7 +1,7 @@
 """Photographs out of a video: the sharpest frame (variance of the Laplacian) of each of so many equal stretches.
 
-Frames come turned as the video's rotation says. Browsers and pipes write no number of frames into the header (webm, mkv),
-so that they are counted first.
+Frames come turned as the video's rotation says. Browsers and pipes write no number of frames into the header (webm,
+mkv), so that they are counted first.
 """
 
 from pathlib import Path

@@ -47,8 +47,16 @@ class Lens:
     def resized(self, width: int, height: int) -> "Lens":
         """The same view with other pixels."""
         a, b = width / self.width, height / self.height
-        size = {"width": width, "height": height, "skew": self.skew * a}
-        return replace(self, **size, fx=self.fx * a, cx=self.cx * a, fy=self.fy * b, cy=self.cy * b)
+        return replace(
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * a,
+            cx=self.cx * a,
+            skew=self.skew * a,
+            fy=self.fy * b,
+            cy=self.cy * b,
+        )
 
     def distort(self, xy: Float64[np.ndarray, "*n 2"]) -> Float64[np.ndarray, "*n 2"]:
         """(x, y) -> (x_d, y_d)."""
@@ -106,8 +114,8 @@ class Lens:
 
     def _refuse(self, name: str) -> NoReturn:
         raise ValueError(
-            f"{name}: the lens distortion {self.radial} {self.denominator} {self.tangential} folds the picture over itself "
-            "before its rim; solve the camera again, with fewer coefficients"
+            f"{name}: the lens distortion {self.radial} {self.denominator} {self.tangential} folds the picture over "
+            "itself before its rim; solve the camera again, with fewer coefficients"
         )
 
     def _slope(self, xy: Float64[np.ndarray, "*n 2"]) -> Float64[np.ndarray, "*n 2 2"]:

@@ -1,11 +1,12 @@
 """LLFF: <path>/poses_bounds.npy and the photographs in <path>/images, in the order of their names.
 
 Each row of poses_bounds.npy holds 17 numbers: a 3 x 5 matrix by rows, and the depths of the nearest and farthest thing.
-The matrix is [camera-to-world rotation | centre | (height, width, focal length) in pixels]; the rotation's columns are the
-camera's down, right and backward directions. Mildenhall et al. (2019), Local Light Field Fusion.
+The matrix is [camera-to-world rotation | centre | (height, width, focal length) in pixels]; the rotation's columns are
+the camera's down, right and backward directions. Mildenhall et al. (2019), Local Light Field Fusion.
 """
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +38,8 @@ class LlffSource(AbstractPosedSource):
             height, width, focal = matrix[:, 4]
             if not (min(height, width, focal) > 0 and np.isfinite(matrix[:, 4]).all()):
                 raise ValueError(
-                    f"{path}: {file.name} gives height {height:g}, width {width:g}, focal length {focal:g}; must be positive"
+                    f"{path}: {file.name} gives height {height:g}, width {width:g}, focal length {focal:g}; all "
+                    "must be positive"
                 )
             down, right, back, centre = matrix[:, :4].T
             pose = torch.eye(4, dtype=torch.float64)
@@ -46,9 +48,7 @@ class LlffSource(AbstractPosedSource):
                 Posed(
                     path=path,
                     name=path.name,
-                    lens=lambda w, h, focal=float(focal): Lens(
-                        width=w, height=h, fx=focal, fy=focal, cx=w / 2, cy=h / 2
-                    ),
+                    lens=partial(_lens, float(focal)),
                     size=(round(width), round(height)),
                     world_to_camera=rigid_inverse(pose, str(path)),
                 )
@@ -69,6 +69,11 @@ class LlffSource(AbstractPosedSource):
         images = photographs_in(require_folder(folder / self.images, "folder of images"))
         if len(images) != len(rows):
             raise ValueError(
-                f"{file} has {len(rows)} rows, {folder / self.images} {len(images)} images; they must agree, row by name"
+                f"{file} has {len(rows)} rows, {folder / self.images} {len(images)} images; they must "
+                "agree, row by name"
             )
         return file, rows, images
+
+
+def _lens(focal: float, width: int, height: int) -> Lens:
+    return Lens(width=width, height=height, fx=focal, fy=focal, cx=width / 2, cy=height / 2)

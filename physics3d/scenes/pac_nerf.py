@@ -60,7 +60,8 @@ class PacNerfSource(AbstractSource):
         instants = [t for t in instants if t >= 0]
         if instants != list(range(len(instants))):
             raise ValueError(f"{file.parent}/data: the cameras share frames {instants}; restore the missing a_C_T.png")
-        images, alphas, cameras, names, videos, times = [], [], [], [], [], {}
+        images, alphas, cameras, names, videos = [], [], [], [], []
+        times: dict[int, float] = {}
         for c in log.progress(sorted(entries), "reading cameras"):
             clip = []
             for t in instants:
@@ -76,8 +77,8 @@ class PacNerfSource(AbstractSource):
                 camera = pinhole(read.lens, pose, str(path))
                 if not math.isclose(times.setdefault(t, float(entry["time"])), float(entry["time"]), abs_tol=1e-6):
                     raise ValueError(
-                        f"{path} is of time {entry['time']} s, frame {t} of another camera of {times[t]} s; the cameras must "
-                        "be filmed at the same instants"
+                        f"{path} is of time {entry['time']} s, frame {t} of another camera of {times[t]} s; they "
+                        "must film at the same instants"
                     )
                 clip.append(read.image)
                 if t == 0:
@@ -183,7 +184,7 @@ def _camera(path: Path, entry: dict, axes: Axes) -> tuple[Callable[[int, int], L
 
 def _same(a: Camera, b: Camera) -> bool:
     """Whether two cameras agree to a hundredth of a pixel and of a millimetre."""
-    lenses = [(c.fx, c.fy, c.cx, c.cy) for c in (a, b)]
-    return bool(np.allclose(*lenses, atol=0.01)) and bool(
+    one, other = ((c.fx, c.fy, c.cx, c.cy) for c in (a, b))
+    return bool(np.allclose(one, other, atol=0.01)) and bool(
         torch.allclose(a.world_to_camera, b.world_to_camera, rtol=0, atol=1e-5)
     )

@@ -4,8 +4,8 @@ Two pictures from one place differ by a rotation R and by what zooming does to t
 
     x' = K' R K^-1 x,      K = diag(f, f, 1) about the middle of the picture
 
-Structure from motion finds some depth in them all the same (a fixed camera and a plant in the wind gave 7 degrees). So of
-each pair of pictures the matches are counted that this explains to `EXPLAINED`; the rest has moved against it.
+Structure from motion finds some depth in them all the same (a fixed camera and a plant in the wind gave 7 degrees). So
+of each pair of pictures the matches are counted that this explains to `EXPLAINED`; the rest has moved against it.
 """
 
 from collections.abc import Iterable
@@ -45,7 +45,7 @@ def explained(a: Float64[np.ndarray, "n 2"], b: Float64[np.ndarray, "n 2"], size
 
 
 def share_explained(pairs: Iterable[tuple[np.ndarray, np.ndarray]], size: float) -> float | None:
-    """The share that a camera in one place explains, of the pair of pictures of which it explains least but for a tenth.
+    """The share that a camera in one place explains, of the pair of which it explains least but for a tenth.
 
     None if no pair has enough matches to tell.
     """

@@ -3,8 +3,8 @@
 C = alpha C_file + (1 - alpha) background          (on the encoded values, as renderers and mattes usually mean it)
 
 The size that a camera file gives says which way round a picture belongs whose EXIF asks for a turn: COLMAP solves
-cameras for pictures as they are stored, others for pictures as they are shown. A picture of the same shape but with other
-pixels is a reduced copy, and its camera is reduced with it.
+cameras for pictures as they are stored, others for pictures as they are shown. A picture of the same shape but with
+other pixels is a reduced copy, and its camera is reduced with it.
 """
 
 from collections.abc import Callable, Sequence
@@ -73,31 +73,26 @@ def read_photograph(
 def _fitting(picture: Picture, size: tuple[int, int] | None, path: Path) -> tuple[Picture, tuple[str, ...]]:
     """The picture the way round that its camera means, and what to say of it. Raises ValueError if none fits."""
     stored, shown = picture.size, picture.shown_size
-    if picture.turn == 1:
-        if size is None or stored == size:
-            return picture, ()
-        if _reduced(stored, size):
-            return picture, ("of another size than their camera file says, so the camera is scaled",)
-    elif size is not None:
-        fits = _equal_or_reduced(stored, size), _equal_or_reduced(shown, size)
-        if fits == (True, False):
-            return picture, ("used as stored, without their EXIF turn: their cameras have that size",)
-        if fits == (False, True):
-            return picture.shown(), ("turned as their EXIF says",)
-    if picture.turn != 1 and (size is None or fits == (True, True)):
+    if picture.turn == 1 and (size is None or stored == size):
+        return picture, ()
+    as_stored = size is not None and (stored == size or _reduced(stored, size))
+    as_shown = size is not None and (shown == size or _reduced(shown, size))
+    if picture.turn == 1 and as_stored:
+        return picture, ("of another size than their camera file says, so the camera is scaled",)
+    if as_stored and not as_shown:
+        return picture, ("used as stored, without their EXIF turn: their cameras have that size",)
+    if as_shown and not as_stored:
+        return picture.shown(), ("turned as their EXIF says",)
+    if size is None or as_stored:
         raise ValueError(
-            f"{path} carries the EXIF turn {picture.turn}, and the camera file does not tell whether its camera is for the "
-            "picture as stored (COLMAP's are) or as shown; remove the turn from the file, or turn the pixels"
+            f"{path} carries the EXIF turn {picture.turn}, and the camera file does not tell whether its camera is for "
+            "the picture as stored (COLMAP's are) or as shown; remove the turn from the file, or turn the pixels"
         )
     either = f" ({shown[0]} x {shown[1]} as shown)" if shown != stored else ""
     raise ValueError(
         f"{path} has {stored[0]} x {stored[1]} pixels{either}, its camera says {size[0]} x {size[1]}; "
         "camera file and images disagree, resize one of them"
     )
-
-
-def _equal_or_reduced(have: tuple[int, int], size: tuple[int, int]) -> bool:
-    return have == size or _reduced(have, size)
 
 
 def _reduced(have: tuple[int, int], size: tuple[int, int]) -> bool:

@@ -110,32 +110,40 @@ class AbstractPosedSource(AbstractSource):
         R, t = M[:, :3, :3], M[:, :3, 3]
         points = None if known is None else known.xyz
         seen = aim(R, t, points)
-        if seen is None and self.scale is None:
+        if self.scale is not None:
+            scale = self.scale
+        elif seen is not None:
+            scale = 1 / seen.distance
+        else:
             raise ValueError(
                 "scale is not given, and the cameras look at no common place to guess it from; set scene.source.scale, "
                 "metres per unit of the camera file"
             )
-        scale = float(self.scale if self.scale is not None else 1 / seen.distance)
-        up, plane = self.up, None
-        if up is None:
-            up = level(R)
+        if self.up is not None:
+            up, plane = triple("up", self.up), None
+        else:
+            held = level(R)
+            plane = None
             if seen is not None and points is not None:
-                plane = floor_plane(points, up, seen.middle, FLAT * seen.distance, seed=0)
-            up = up if plane is None else plane[:3]
-        a, b, c = (float(u) for u in up)
-        if self.up is None:
+                plane = floor_plane(points, held, seen.middle, FLAT * seen.distance, seed=0)
+            up = triple("up", (held if plane is None else plane[:3]).tolist())
             basis = "how the cameras were held" if plane is None else "the normal of the largest level plane of points"
-            log.warn(f"up is not given: taken from {basis}, [{a:.3f}, {b:.3f}, {c:.3f}] (scene.source.up)")
+            log.warn(f"up is not given: taken from {basis}, [{up[0]:.3f}, {up[1]:.3f}, {up[2]:.3f}] (scene.source.up)")
         if self.scale is None:
             log.warn(
-                f"scale is not given: {scale:.4g} metres per unit puts the cameras 1 m from what they look at; measure one "
-                "length and set scene.source.scale"
+                f"scale is not given: {scale:.4g} metres per unit puts the cameras 1 m from what they look at; measure "
+                "one length and set scene.source.scale"
             )
         if plane is None:
-            return Axes(up=(a, b, c), scale=scale), None
+            return Axes(up=up, scale=scale), None
         floor = float(-scale * plane[3])
         log.info(f"assumed: that plane is the floor, z = {floor:.3f} m")
-        return Axes(up=(a, b, c), scale=scale), floor
+        return Axes(up=up, scale=scale), floor
+
+
+def fixed(lens: Lens) -> Callable[[int, int], Lens]:
+    """For `Posed.lens`, of a lens that the camera file gives whole."""
+    return lambda width, height: lens
 
 
 def pinhole(lens: Lens, world_to_camera: Float64[Tensor, "4 4"], name: str) -> Camera:
@@ -163,6 +171,6 @@ def where(capture: Capture, log) -> None:
         return
     middle = ", ".join(f"{m:.3f}" for m in seen.middle)
     log.info(
-        f"the cameras look at [{middle}] m (e.g. for excitation.centre), from {seen.distance:.3g} m in the middle, over "
-        f"{seen.span:.0f} degrees"
+        f"the cameras look at [{middle}] m (e.g. for excitation.centre), from {seen.distance:.3g} m in the middle, "
+        f"over {seen.span:.0f} degrees"
     )

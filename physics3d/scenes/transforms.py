@@ -3,17 +3,18 @@
     {"camera_angle_x": rad, "camera_angle_y": rad, "frames": [{"file_path": "./train/r_0", "transform_matrix": 4x4}]}
     {"fl_x": px, "fl_y": px, "cx": px, "cy": px, "w": px, "h": px, "k1": ..., "p1": ..., "frames": [...]}
 
-What describes the lens may also stand in a frame and holds there. transform_matrix is camera-to-world with OpenGL camera
-axes (x right, y up, z backward). Pictures are undistorted as they are read: k1, k2, p1, p2 are OpenCV's, k3 and k4 the
-factors of r^6 and r^8 (Brown's, as nerfstudio computes them); with "camera_model": "FULL_OPENCV", or with k5 or k6,
-k4, k5 and k6 are OpenCV's denominator. A picture's `mask_path` is black where it shows nothing of the object, a mask is
-taken as its matte. Points of structure from motion are taken from `ply_file_path`, or from points3D.npz (xyz, rgb)
-beside the file. Mildenhall et al. 2020; docs.nerf.studio, "data conventions".
+What describes the lens may also stand in a frame and holds there. transform_matrix is camera-to-world with OpenGL
+camera axes (x right, y up, z backward). Pictures are undistorted as they are read: k1, k2, p1, p2 are OpenCV's, k3 and k4 the
+factors of r^6 and r^8 (Brown's, as nerfstudio computes them); with "camera_model": "FULL_OPENCV", or with k5 or k6, k4,
+k5 and k6 are OpenCV's denominator. A picture's `mask_path` is black where it shows nothing of the object and is taken
+as its matte. Points of structure from motion are taken from `ply_file_path`, or from points3D.npz (xyz, rgb) beside the
+file. Mildenhall et al. 2020; docs.nerf.studio, "data conventions".
 """
 
 import json
 import math
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -62,7 +63,7 @@ class TransformsSource(AbstractPosedSource):
                 Posed(
                     path=path,
                     name=str(path.relative_to(file.parent)) if path.is_relative_to(file.parent) else str(path),
-                    lens=lambda width, height, frame=frame, path=path: _lens(file, content, frame, path, width, height),
+                    lens=partial(_lens, file, content, frame, path),
                     size=_size(entry, path),
                     world_to_camera=_pose(file, entry, path),
                     mask=_mask(file, content, frame),
@@ -175,8 +176,8 @@ def _pose(file: Path, entry: dict, path: Path) -> Float64[Tensor, "4 4"]:
         raise ValueError(f"{file}: entry of {path.name} needs a 4x4 transform_matrix: {error!r}") from error
     if torch.isfinite(pose).all() and (pose[3] - torch.tensor([0.0, 0.0, 0.0, 1.0])).abs().max() > 1e-6:
         raise ValueError(
-            f"{path}: the last row of transform_matrix is {pose[3].tolist()}, not 0 0 0 1; transpose it if it is written by "
-            "columns"
+            f"{path}: the last row of transform_matrix is {pose[3].tolist()}, not 0 0 0 1; transpose it if it is "
+            "written by columns"
         )
     return rigid_inverse(pose @ OPENGL_TO_OPENCV, str(path))
 

@@ -90,8 +90,8 @@ class UnposedSource(AbstractSource):
             log.warn(f"not placed, left out: {', '.join(solved.lost[:12])}{', ...' if len(solved.lost) > 12 else ''}")
         if solved.span < NARROW:
             log.warn(
-                f"the cameras span only {solved.span:.0f} degrees around what they look at: depth is uncertain, and what is "
-                "behind was never seen; walk further around it"
+                f"the cameras span only {solved.span:.0f} degrees around what they look at: depth is uncertain, and "
+                "what is behind was never seen; walk further around it"
             )
         log.info(
             "assumed: up is the normal of the largest level plane, which is the floor at z = 0"

@@ -167,7 +167,7 @@ def test_what_has_no_size_or_infinite_size_is_named(tmp_path):
 
 @pytest.mark.parametrize("unit", [1e-2, 1.0, 30.0])
 def test_opacity_and_scale_that_were_stored_as_they_are_are_told_apart(tmp_path, unit, rng):
-    """A lattice of Gaussians half as wide as their distance, in units so large and so small that ln changes its sign."""
+    """A lattice of Gaussians half as wide as their distance; the unit decides the sign of ln."""
     n = 64
     mean = unit * np.stack(np.unravel_index(np.arange(n), (4, 4, 4)), -1)
     size = unit * rng.uniform(0.3, 0.6, (n, 3))

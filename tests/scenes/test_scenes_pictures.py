@@ -65,7 +65,9 @@ def transparent_palette(f) -> None:
 MATTES = {
     "rgba.png": (lambda f: Image.fromarray(np.dstack([RAMP, MATTE])).save(f), MATTE, RAMP, 0),
     "grey_alpha.png": (lambda f: Image.fromarray(np.dstack([GREY, MATTE])).save(f), MATTE, GREY, 0),
-    "rgba.webp": (lambda f: Image.fromarray(np.dstack([RAMP, MATTE])).save(f, lossless=True, exact=True), MATTE, RAMP, 0),
+    "rgba.webp": (
+        lambda f: Image.fromarray(np.dstack([RAMP, MATTE])).save(f, lossless=True, exact=True), MATTE, RAMP, 0,
+    ),
     "rgba16.tif": (
         lambda f: cv2.imwrite(str(f), np.dstack([RAMP[..., ::-1], MATTE]).astype(np.uint16) * 257), MATTE, RAMP, 1,
     ),

@@ -200,7 +200,8 @@ def test_photographs_of_subfolders_are_read_where_there_are_no_others(tmp_path, 
 
 
 @pytest.mark.parametrize("names, remedy", [
-    (["IMG_1.HEIC", "IMG_2.dng"], "1 .dng, 1 .heic; convert HEIC"), (["a.MOV"], "give the file itself"), ([], "but nothing"),
+    (["IMG_1.HEIC", "IMG_2.dng"], "1 .dng, 1 .heic; convert HEIC"), (["a.MOV"], "give the file itself"),
+    ([], "but nothing"),
 ])  # fmt: skip
 def test_a_folder_without_photographs_says_what_it_holds(names, remedy, tmp_path):
     for name in names:
@@ -257,8 +258,8 @@ def test_a_camera_in_one_place_explains_its_pictures_and_one_that_moves_does_not
             np.eye(3), np.zeros(3), 700, points + [0.1, 0, 0] * (np.arange(200) < 40)[:, None]
         ),
     }
-    # the noise of two pictures, 0.4 px and more with the zoom, reaches beyond 1.6 px (a five-hundredth of 800) once in a
-    # thousand, and a fit to 200 matches is a little off; a fifth moves
+    # the noise of two pictures, 0.4 px and more with the zoom, reaches beyond 1.6 px (a five-hundredth of 800) once in
+    # a thousand, and a fit to 200 matches is a little off; a fifth moves
     assert still[kind]() > (0.7 if kind == "thing moves" else 0.85)
     # a step of 30 cm sideways, seen at 3 to 6 m: 70 to 35 px, of which a turn takes the mean
     assert share(turn, np.array([0.3, 0, 0]), 700) < 0.25
@@ -317,7 +318,8 @@ def test_pictures_can_be_written_after_pycolmap_was_loaded(tmp_path):
 
     code = (
         "from physics3d.scenes.sfm import _pycolmap; _pycolmap(); from PIL import Image; import numpy as np;"
-        f"Image.fromarray(np.random.default_rng(0).integers(0, 255, (240, 360, 3), np.uint8)).save({str(tmp_path / 'a.png')!r})"
+        "noise = np.random.default_rng(0).integers(0, 255, (240, 360, 3), np.uint8);"
+        f"Image.fromarray(noise).save({str(tmp_path / 'a.png')!r})"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120, capture_output=True)
 
