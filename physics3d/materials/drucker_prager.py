@@ -67,7 +67,7 @@ class DruckerPrager(AbstractMaterial):
 @functools.cache
 def _advance(real: type) -> wp.Function:
     mat33 = matrix(real)
-    relax, carried, store = log_strain.relax(real), carried_strain(real), store_strain(real)
+    rescale, carried, store = log_strain.rescale(real), carried_strain(real), store_strain(real)
     expm1 = scalars.expm1(real)
     gone = real(60.0)  # e^-60: what is left of a strain that is given up
 
@@ -101,11 +101,11 @@ def _advance(real: type) -> wp.Function:
         mu, K = coefficients[0, p], coefficients[1, p]
         X = carried(p, 0, M, memory)
         X = X + expm1(real(2.0) * memory[6, p] / real(3.0)) * (one + X)
-        eps, _unrelaxed = relax(X, real(0.0), real(0.0))
+        eps, _same = rescale(X, real(1.0), real(1.0), real(0.0), real(0.0))
         trace = wp.trace(eps)
         dev = eps - trace / real(3.0) * one
         d, v = shrinkage(dev, trace, mu, K, coefficients[2, p])
-        _half, X_next = relax(X, d, v)
+        _eps, X_next = rescale(X, real(1.0), real(1.0), expm1(-d), expm1(-v))
         store(p, 0, X_next, memory_next)
         memory_next[6, p] = wp.max(trace, real(0.0))
         return H + M + M * H, real(2.0) * mu * wp.exp(-d) * dev + K * wp.exp(-v) * trace * one

@@ -3,6 +3,7 @@
     psi(F) = mu/2 (tr(F^T F) - 3) - mu ln J + lam/2 (ln J)^2        [J/m^3]
     tau    = mu (F F^T - I) + lam ln(J) I                           [Pa]
 
+J is integrated by itself, J_next = J det(I + dt L), and kept in the memory: nearly incompressible bodies in float32.
 Below J = 1e-4 the logarithm goes on along its tangent, so an inverted element is pushed back with a finite force.
 Bonet and Wood (2008), sec. 6.4.3.
 """
@@ -40,6 +41,10 @@ class NeoHookean(AbstractMaterial):
         return {"youngs_modulus": 1e5, "poissons_ratio": 0.4}  # soft rubber
 
     @property
+    def memory_rows(self) -> int:
+        return 1
+
+    @property
     def recovers(self) -> bool:
         return True
 
@@ -52,12 +57,12 @@ class NeoHookean(AbstractMaterial):
         return lam + 2 * mu
 
     def energy(
-        self, coefficients: Float[Tensor, "2 n"], H: Float[Tensor, "n 3 3"], memory: Float[Tensor, "0 n"]
+        self, coefficients: Float[Tensor, "2 n"], H: Float[Tensor, "n 3 3"], memory: Float[Tensor, "1 n"]
     ) -> Float[Tensor, " n"]:
         mu, lam = coefficients
         F = H + torch.eye(3, dtype=H.dtype, device=H.device)
         # finite where round-off makes J <= 0, for which there is no energy
-        J = torch.linalg.det(F).clamp(min=1e-30)
+        J = (1 + memory[0]).clamp(min=1e-30)
         log_J, floor = torch.log(J), math.log(_FLOOR)
         # below the floor the integral of the tangent, so that the derivative is the stress there too
         below = floor**2 / 2 + (floor - 1) * (log_J - floor) + J / _FLOOR - 1
@@ -71,7 +76,7 @@ class NeoHookean(AbstractMaterial):
 @functools.cache
 def _advance(real: type) -> wp.Function:
     mat33 = matrix(real)
-    volume_change = volume.volume_change(real)
+    carried_volume = volume.carried_volume(real)
     log1p_extended = scalars.log1p_extended(real, _FLOOR)
 
     @wp.func(name=f"neo_hookean_{real.__name__}")
@@ -81,13 +86,15 @@ def _advance(real: type) -> wp.Function:
         L: mat33,  # velocity gradient [1/s]
         H: mat33,  # F - I
         coefficients: wp.array2d(dtype=real),  # mu, lam [Pa]
-        memory: wp.array2d(dtype=real),
+        memory: wp.array2d(dtype=real),  # J - 1
         memory_next: wp.array2d(dtype=real),
     ):
         M = dt * L
         H_next = H + M + M * H
         X = H_next + wp.transpose(H_next) + H_next * wp.transpose(H_next)  # F F^T - I
-        log_J = log1p_extended(volume_change(H_next))
+        j = carried_volume(memory[0, p], M)
+        memory_next[0, p] = j
+        log_J = log1p_extended(j)
         tau = coefficients[0, p] * X + coefficients[1, p] * log_J * wp.identity(n=3, dtype=real)
         return H_next, tau
 

@@ -1,7 +1,12 @@
 """Weakly compressible fluid, Newtonian or power-law: water, honey, ketchup above its yield.
 
-    tau = K J (J - 1) I + 2 eta J dev D,   D = sym L                                [Pa]
+    tau = K J (J - 1) I + 2 eta J dev D                                             [Pa]
     eta = k g^(n - 1),   g^2 = 2 dev D : dev D + g_0^2,   g_0 = 1e-3 1/s            n = 1: Newtonian, eta = k
+    D   = (B - B^-1)/(4 dt),   B = (I + dt L)(I + dt L)^T                           [1/s]
+
+D is the rate of deformation of a finite step: sym L for a short one, nothing for a rotation however large, turning
+with whoever turns, exact in shear. It stands as the body does at the end of the step, so that a sheared fluid has
+normal stresses of +-eta dt/2 times the square of the shear rate.
 
 J is integrated by itself, (J - 1)_next from det(I + dt L): the determinant of a long-sheared F would lose it. A viscous
 explicit step needs dt < rho dx^2 / (6 eta) besides the sound-speed limit. Bird, Armstrong, Hassager (1987), sec. 4.1.
@@ -70,8 +75,20 @@ class Newtonian(AbstractMaterial):
 @functools.cache
 def _advance(real: type) -> wp.Function:
     mat33 = matrix(real)
-    volume_change = volume.volume_change(real)
+    carried_volume = volume.carried_volume(real)
     least2 = real(_LEAST_RATE**2)
+
+    cofactor, least_det = volume.cofactor(real), real(1e-12)
+
+    @wp.func(name=f"rate_of_deformation_{real.__name__}")
+    def rate(dt: real, L: mat33, M: mat33):
+        D = real(0.5) * (L + wp.transpose(L))
+        if dt > real(0.0):
+            X = M + wp.transpose(M) + M * wp.transpose(M)
+            B = wp.identity(n=3, dtype=real) + X
+            inverse = cofactor(B) / wp.max(wp.determinant(B), least_det)  # finite where the step flattens the body
+            D = (X + X * inverse) / (real(4.0) * dt)
+        return D
 
     @wp.func(name=f"newtonian_{real.__name__}")
     def advance(
@@ -85,10 +102,11 @@ def _advance(real: type) -> wp.Function:
     ):
         one = wp.identity(n=3, dtype=real)
         M = dt * L
-        j = memory[0, p] + (real(1.0) + memory[0, p]) * volume_change(M)
+        j = carried_volume(memory[0, p], M)
         memory_next[0, p] = j
         J = real(1.0) + j
-        D = real(0.5) * (L + wp.transpose(L)) - wp.trace(L) / real(3.0) * one
+        D = rate(dt, L, M)
+        D = D - wp.trace(D) / real(3.0) * one
         g2 = real(2.0) * wp.ddot(D, D) + least2
         eta = coefficients[1, p] * wp.pow(g2, real(0.5) * (coefficients[2, p] - real(1.0)))
         return H + M + M * H, coefficients[0, p] * J * j * one + real(2.0) * eta * wp.max(J, real(0.0)) * D

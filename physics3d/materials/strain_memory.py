@@ -22,18 +22,41 @@ from physics3d.warp_types import matrix
 
 
 @functools.cache
-def carried_strain(real: type) -> wp.Function:
-    """carried(p, row, M, memory) -> X_trial: the elastic strain X = b - I stored in six rows of column p, carried by
-    the increment I + M: b_trial = (I + M) b (I + M)^T."""
+def load_strain(real: type) -> wp.Function:
+    """load(p, row, memory) -> X, the strain in six rows of column p."""
     mat33 = matrix(real)
+
+    @wp.func(name=f"load_strain_{real.__name__}")
+    def load(p: int, row: int, memory: wp.array2d(dtype=real)):
+        xx, xy, xz = memory[row, p], memory[row + 1, p], memory[row + 2, p]
+        yy, yz, zz = memory[row + 3, p], memory[row + 4, p], memory[row + 5, p]
+        return mat33(xx, xy, xz, xy, yy, yz, xz, yz, zz)
+
+    return load
+
+
+@functools.cache
+def carry_strain(real: type) -> wp.Function:
+    """carry(X, M) -> (I + M)(I + X)(I + M)^T - I."""
+    mat33 = matrix(real)
+
+    @wp.func(name=f"carry_{real.__name__}")
+    def carry(X: mat33, M: mat33):
+        N = M + M * X
+        return X + N + wp.transpose(N) + N * wp.transpose(M)
+
+    return carry
+
+
+@functools.cache
+def carried_strain(real: type) -> wp.Function:
+    """carried(p, row, M, memory) -> X_trial: the strain in six rows of column p, carried by I + M."""
+    mat33 = matrix(real)
+    load, carry_ = load_strain(real), carry_strain(real)
 
     @wp.func(name=f"carried_strain_{real.__name__}")
     def carried(p: int, row: int, M: mat33, memory: wp.array2d(dtype=real)):
-        xx, xy, xz = memory[row, p], memory[row + 1, p], memory[row + 2, p]
-        yy, yz, zz = memory[row + 3, p], memory[row + 4, p], memory[row + 5, p]
-        X = mat33(xx, xy, xz, xy, yy, yz, xz, yz, zz)
-        N = M + M * X
-        return X + N + wp.transpose(N) + N * wp.transpose(M)
+        return carry_(load(p, row, memory), M)
 
     return carried
 

@@ -2,16 +2,23 @@
 
     tau   = tau_E + sum_N tau_N                                                     [Pa], Kirchhoff
     psi_E = mu sum_i (s_i - 1)^2 + lam/2 (J - 1)^2                                  fixed corotated, F = V R
-    tau_E = 2 mu (V^2 - V) + lam J (J - 1) I
+    tau_E = 2 mu (V^2 - V) + lam J (J - 1) I                                        J integrated by itself
     tau_N = 2 mu_N eps + lam_N tr(eps) I,   eps = 1/2 ln b_N                        Hencky spring
     d(dev eps)/dt = -k_d dev eps,   d(tr eps)/dt = -k_v tr eps                      dash-pot, [1/s]
 
-One substep of a branch (Strang): b_N is carried by the flow, the stress is taken from the half-relaxed strain, the
-fully relaxed strain is stored as X = b_N - I. Second order in dt, stable for every dt k; the stored strain is half a
-step ahead.
+One step of a branch, x = k dt: what is left of the strain of the last step, g(x) eps_n, is carried by the flow, and all
+of it decays by w(x), with g = x/(e^x - 1), w = (1 - e^-x)/x (`tensors/decay.py`):
 
-`spring="neo_hookean"` replaces the Hencky spring, whose shear stress falls beyond a shear of 3
-(`neo_hookean_branch.py`).
+    b_tr = (I + dt L) exp(2 g eps_n) (I + dt L)^T,   eps_n+1 = w 1/2 ln b_tr,   tau_N from eps_n+1
+
+Exact, whatever the steps, where stretching keeps its axes and within each step its rate, at rest, and in slow flow;
+else of second order; stable for every x. As w and the g of the next step follow each other, one decomposition does
+both: after a short step the strain is stored ahead, times the g of another step like it, together with that step's
+length. A step of another length begins by the quotient of the two, and one of no length finds the stress at the end of
+the last.
+
+`spring="neo_hookean"` replaces the Hencky spring, whose shear stress falls beyond a shear of 3, `flow` chooses its
+dash-pot (`neo_hookean_branch.py`); with a Hencky spring both are the same.
 
 Liu et al. (arXiv 2406.04338); where and why we depart from it: docs/method.md.
 """
@@ -28,10 +35,10 @@ from torch import Tensor
 
 from physics3d.checks import MayBeInfinite, Positive, at_least_one, require_fields
 from physics3d.materials.base import AbstractMaterial
-from physics3d.materials.neo_hookean_branch import maxwell_neo_hookean
+from physics3d.materials.neo_hookean_branch import neo_hookean_branch
 from physics3d.materials.parameters import ELASTIC, Values, lame, rows
-from physics3d.materials.strain_memory import carried_strain, hencky_energy, principal_log_strain, store_strain
-from physics3d.materials.tensors import log_strain, polar, volume
+from physics3d.materials.strain_memory import carry_strain, load_strain, principal_log_strain, store_strain
+from physics3d.materials.tensors import decay, log_strain, polar, scalars, volume
 from physics3d.materials.tensors.replay import without_replay
 from physics3d.warp_types import matrix
 
@@ -50,12 +57,15 @@ class Viscoelastic(AbstractMaterial):
     branch_bulk_modulus (K_N) [Pa], shear_relaxation_time (1/k_d), bulk_relaxation_time (1/k_v) [s, inf: never relaxes];
     those of further branches end in _2, _3.
 
-    Raises ValueError for a number of branches outside 0..3, an unknown spring, or nothing at all.
+    spring: what is stretched in a branch; flow: what its dash-pot follows, the logarithmic strain or the stress.
+
+    Raises ValueError for a number of branches outside 0..3, an unknown spring or flow, or nothing at all.
     """
 
     branches: Annotated[int, Ge(0), Le(3)] = 1
     elastic: bool = True  # the branch that never relaxes
     spring: Literal["hencky", "neo_hookean"] = "hencky"
+    flow: Literal["log_strain", "stress"] = "log_strain"
 
     RULES = (at_least_one("elastic", "branches"),)  # else no stress is defined
     RANGES = ELASTIC | BRANCH
@@ -85,7 +95,7 @@ class Viscoelastic(AbstractMaterial):
 
     @property
     def memory_rows(self) -> int:
-        return 6 * self.branches
+        return self._first_memory + 7 * self.branches
 
     def coefficients(self, values: Values) -> Float[Tensor, "k n"]:
         self.check_parameters(values)
@@ -108,89 +118,120 @@ class Viscoelastic(AbstractMaterial):
         """Row of the first coefficient of a branch."""
         return (2 if self.elastic else 0) + 4 * branch
 
+    @property
+    def _first_memory(self) -> int:
+        """Row of the first branch: before it stands J - 1 of the elastic one."""
+        return 1 if self.elastic else 0
+
     def energy(
         self, coefficients: Float[Tensor, "k n"], H: Float[Tensor, "n 3 3"], memory: Float[Tensor, "m n"]
     ) -> Float[Tensor, " n"]:
-        one = torch.eye(3, dtype=H.dtype, device=H.device)
         psi = torch.zeros_like(H[:, 0, 0])
         if self.elastic:
             mu, lam = coefficients[:2]
-            J = volume.determinant(one + H)
-            psi = psi + mu * polar.stretch_distance(H) + lam / 2 * (J - 1) ** 2
+            psi = psi + mu * polar.stretch_distance(H) + lam / 2 * memory[0] ** 2
         for i in range(self.branches):
             mu, K = coefficients[self._first(i) : self._first(i) + 2]
-            strain = memory[6 * i : 6 * i + 6]
-            if self.spring == "hencky":
-                psi = psi + hencky_energy(mu, K, strain)
-            else:
-                dev, log_J = principal_log_strain(strain)
-                psi = psi + mu / 2 * torch.expm1(2 * dev).sum(1) + K / 2 * log_J**2
+            k_d, k_v = coefficients[self._first(i) + 2 : self._first(i) + 4]
+            row = self._first_memory + 7 * i
+            strain, ahead = memory[row : row + 6], memory[row + 6]
+            dev, log_J = principal_log_strain(strain)
+            # at the end of the step: what is ahead has relaxed by g already
+            dev, log_J = dev * _grown(k_d * ahead)[:, None], log_J * _grown(k_v * ahead)
+            shear = (dev**2).sum(1) if self.spring == "hencky" else torch.expm1(2 * dev).sum(1) / 2
+            psi = psi + mu * shear + K / 2 * log_J**2
         return psi
 
     def advance(self, real: type) -> wp.Function:
-        return _advance(self.branches, self.elastic, self.spring, real)
+        return _advance(self.branches, self.elastic, self.spring, self.flow, real)
 
 
 @functools.cache
-def maxwell_hencky(real: type) -> wp.Function:
-    """One step of a Hencky spring in series with a dash-pot, from the carried strain X = b - I, eps = 1/2 ln(I + X).
+def hencky_branch(real: type) -> tuple[wp.Function, wp.Function, wp.Function]:
+    """A Hencky spring in series with a dash-pot, one step of dt: (prepare, relax, ahead), eps = 1/2 ln(I + X).
 
-        maxwell(X, mu, K, d, v) -> (tau, X_next)      d, v = dt k_d, dt k_v
-        tau    = 2 mu e^{-d/2} dev eps + K e^{-v/2} tr(eps) I                                    [Pa], as mu and K
-        X_next = exp(2 [e^{-d} dev eps + e^{-v} tr(eps)/3 I]) - I
+        prepare(X, ahead, dt, k_d, k_v) -> X        dev eps g(k_d dt)/g(k_d ahead), tr eps likewise
+        relax(X, mu, K, d, v) -> (tau, X_next)      d, v = k_d dt, k_v dt, of the carried X
+            tau      = 2 mu w(d) dev eps + K w(v) tr(eps) I                                      [Pa], as mu and K
+            eps_next = w(d) dev eps + w(v) tr(eps)/3 I, or e^-d, e^-v: ahead of the next step
+        ahead(dt, d, v) -> dt if the strain is stored ahead of a next step of dt, else 0             [s]
 
-    Relaxation enters as expm1, so a slow one is an exact small increment of X and none leaves X as it is.
-    `without_replay`.
+    Relaxation enters as factors less one, so a slow one is an exact small increment of X and none leaves X as it is.
     """
     mat33 = matrix(real)
-    relaxed, adjoint = log_strain.relaxed(real), log_strain.adjoint_of_relaxed(real)
+    rescale, rescaled = log_strain.rescale(real), log_strain.rescaled(real)
+    adjoint, expm1 = log_strain.adjoint_of_rescaled(real), scalars.expm1(real)
+    mean_decay, slope, share_left = decay.mean_decay(real), decay.mean_decay_slope(real), decay.share_left(real)
+    near = real(_NEAR)
 
-    @wp.func(name=f"maxwell_hencky_{real.__name__}")
-    def maxwell(X: mat33, mu: real, K: real, d: real, v: real):
-        tau, X_next = relaxed(X, mu, K, d, v)
+    @wp.func(name=f"hencky_prepare_{real.__name__}")
+    def prepare(X: mat33, ahead: real, dt: real, k_d: real, k_v: real):
+        left = X
+        if ahead != dt:
+            had_d, had_v = share_left(k_d * ahead), share_left(k_v * ahead)
+            d = (share_left(k_d * dt) - had_d) / (real(1.0) + had_d)
+            v = (share_left(k_v * dt) - had_v) / (real(1.0) + had_v)
+            _A, rescaled_X = rescale(X, real(0.0), real(0.0), d, v)
+            left = rescaled_X
+        return left
+
+    @wp.func(name=f"hencky_relax_{real.__name__}")
+    def relax(X: mat33, mu: real, K: real, d: real, v: real):
+        w_d, less_d = mean_decay(d)
+        w_v, less_v = mean_decay(v)
+        if wp.max(d, v) < near:
+            less_d, less_v = expm1(-d), expm1(-v)
+        tau, X_next = rescaled(X, real(2.0) * mu * w_d, real(3.0) * K * w_v, less_d, less_v)
         return tau, X_next
 
-    @wp.func_grad(maxwell)
-    def adj_maxwell(X: mat33, mu: real, K: real, d: real, v: real, adj_tau: mat33, adj_X_next: mat33):
-        dh, vh = wp.exp(-real(0.5) * d), wp.exp(-real(0.5) * v)
-        shear, df, vf = real(2.0) * mu * dh, dh * dh, vh * vh
-        adj_X, dev_a, dev_b, mean, a, b = adjoint(X, shear, K * vh, df, vf, adj_tau, adj_X_next)
+    @wp.func_grad(relax)
+    def adj_relax(X: mat33, mu: real, K: real, d: real, v: real, adj_tau: mat33, adj_X_next: mat33):
+        w_d, less_d = mean_decay(d)
+        w_v, less_v = mean_decay(v)
+        slope_d, slope_v = slope(d, less_d), slope(v, less_v)
+        stored_d, stored_v = slope_d, slope_v
+        if wp.max(d, v) < near:
+            less_d, less_v = expm1(-d), expm1(-v)
+            stored_d, stored_v = -wp.exp(-d), -wp.exp(-v)
+        shear, pressure = real(2.0) * mu * w_d, real(3.0) * K * w_v
+        adj_X, adj_shear, adj_pressure, adj_d, adj_v = adjoint(X, shear, pressure, less_d, less_v, adj_tau, adj_X_next)
         wp.adjoint[X] += adj_X
-        wp.adjoint[mu] += real(2.0) * dh * dev_a
-        wp.adjoint[K] += real(3.0) * vh * mean * a
-        wp.adjoint[d] += -real(0.5) * shear * dev_a - df * dev_b
-        wp.adjoint[v] += -real(1.5) * K * vh * mean * a - vf * mean * b
+        wp.adjoint[mu] += real(2.0) * w_d * adj_shear
+        wp.adjoint[K] += real(3.0) * w_v * adj_pressure
+        wp.adjoint[d] += real(2.0) * mu * slope_d * adj_shear + stored_d * adj_d
+        wp.adjoint[v] += real(3.0) * K * slope_v * adj_pressure + stored_v * adj_v
 
-    return without_replay(maxwell)
+    @wp.func(name=f"hencky_ahead_{real.__name__}")
+    def ahead(dt: real, d: real, v: real):
+        result = real(0.0)
+        if wp.max(d, v) < near:
+            result = dt
+        return result
 
-
-_MAXWELL = {"hencky": maxwell_hencky, "neo_hookean": maxwell_neo_hookean}
+    return prepare, without_replay(relax), ahead
 
 
 @functools.cache
 def _corotated(real: type) -> wp.Function:
-    """corotated(H, mu, lam) -> stress of the elastic branch."""
+    """corotated(H, j, mu, lam) -> stress of the elastic branch, j = J - 1."""
     mat33 = matrix(real)
-    volume_change, cofactor = volume.volume_change(real), volume.cofactor(real)
     stretch, adjoint_of_stretch = polar.stretch(real), polar.adjoint_of_stretch(real)
 
     @wp.func(name=f"corotated_{real.__name__}")
-    def corotated(H: mat33, mu: real, lam: real):
+    def corotated(H: mat33, j: real, mu: real, lam: real):
         Y = stretch(H)
-        j = volume_change(H)
         return real(2.0) * mu * (Y + Y * Y) + lam * (real(1.0) + j) * j * wp.identity(n=3, dtype=real)
 
     @wp.func_grad(corotated)
-    def adj_corotated(H: mat33, mu: real, lam: real, adj_ret: mat33):
+    def adj_corotated(H: mat33, j: real, mu: real, lam: real, adj_ret: mat33):
         one = wp.identity(n=3, dtype=real)
         Y = stretch(H)
-        j = volume_change(H)
         A = real(0.5) * (adj_ret + wp.transpose(adj_ret))
         AY = A * Y
         trace = wp.trace(A)
-        F = one + H
         adj_Y = real(2.0) * mu * (A + AY + wp.transpose(AY))
-        wp.adjoint[H] += adjoint_of_stretch(F, one + Y, adj_Y) + lam * (real(1.0) + real(2.0) * j) * trace * cofactor(F)
+        wp.adjoint[H] += adjoint_of_stretch(one + H, one + Y, adj_Y)
+        wp.adjoint[j] += lam * (real(1.0) + real(2.0) * j) * trace
         wp.adjoint[mu] += real(2.0) * (wp.trace(AY) + wp.ddot(AY, Y))
         wp.adjoint[lam] += (real(1.0) + j) * j * trace
 
@@ -198,14 +239,14 @@ def _corotated(real: type) -> wp.Function:
 
 
 @functools.cache
-def maxwell_branches(branches: int, spring: str, real: type) -> wp.Function:
+def maxwell_branches(branches: int, spring: str, flow: str, real: type) -> wp.Function:
     """all(p, dt, M, first, row, coefficients, memory, memory_next) -> stress of the branches, carried by I + M and
     relaxed over dt; their coefficients begin at row `first`, their memory at `row`."""
     mat33 = matrix(real)
-    maxwell = _MAXWELL[spring](real)
-    carried, store = carried_strain(real), store_strain(real)
+    prepare, relax, ahead = hencky_branch(real) if spring == "hencky" else neo_hookean_branch(flow, real)
+    load, carry, store = load_strain(real), carry_strain(real), store_strain(real)
 
-    @wp.func(name=f"maxwell_branches_{branches}_{spring}_{real.__name__}")
+    @wp.func(name=f"maxwell_branches_{branches}_{spring}_{flow}_{real.__name__}")
     def all_branches(
         p: int,
         dt: real,  # [s]
@@ -213,16 +254,17 @@ def maxwell_branches(branches: int, spring: str, real: type) -> wp.Function:
         first: int,
         row: int,
         coefficients: wp.array2d(dtype=real),  # from `first`: mu_N, K_N [Pa], k_d, k_v [1/s] of each branch
-        memory: wp.array2d(dtype=real),  # from `row`: upper triangle of b_N - I of each branch
+        memory: wp.array2d(dtype=real),  # from `row`: upper triangle of b_N - I, by how much it is ahead [s]
         memory_next: wp.array2d(dtype=real),
     ):
         tau = mat33()
         for i in range(wp.static(branches)):
-            k = first + 4 * i
+            k, m = first + 4 * i, row + 7 * i
             d, v = dt * coefficients[k + 2, p], dt * coefficients[k + 3, p]
-            X_trial = carried(p, row + 6 * i, M, memory)
-            tau_N, X = maxwell(X_trial, coefficients[k, p], coefficients[k + 1, p], d, v)
-            store(p, row + 6 * i, X, memory_next)
+            X_left = prepare(load(p, m, memory), memory[m + 6, p], dt, coefficients[k + 2, p], coefficients[k + 3, p])
+            tau_N, X = relax(carry(X_left, M), coefficients[k, p], coefficients[k + 1, p], d, v)
+            store(p, m, X, memory_next)
+            memory_next[m + 6, p] = ahead(dt, d, v)
             tau = tau + tau_N
         return tau
 
@@ -230,12 +272,12 @@ def maxwell_branches(branches: int, spring: str, real: type) -> wp.Function:
 
 
 @functools.cache
-def _advance(branches: int, elastic: bool, spring: str, real: type) -> wp.Function:
+def _advance(branches: int, elastic: bool, spring: str, flow: str, real: type) -> wp.Function:
     mat33 = matrix(real)
-    corotated = _corotated(real)
-    all_branches = maxwell_branches(branches, spring, real)
-    key = f"{branches}_{'elastic' if elastic else 'viscous'}_{spring}_{real.__name__}"
-    first = 2 if elastic else 0
+    corotated, carried_volume = _corotated(real), volume.carried_volume(real)
+    all_branches = maxwell_branches(branches, spring, flow, real)
+    key = f"{branches}_{'elastic' if elastic else 'viscous'}_{spring}_{flow}_{real.__name__}"
+    first, row = (2, 1) if elastic else (0, 0)
 
     @wp.func(name=f"viscoelastic_{key}")
     def advance(
@@ -244,16 +286,18 @@ def _advance(branches: int, elastic: bool, spring: str, real: type) -> wp.Functi
         L: mat33,  # velocity gradient [1/s]
         H: mat33,  # F - I
         coefficients: wp.array2d(dtype=real),  # mu, lam [Pa], then mu_N, K_N [Pa], k_d, k_v [1/s] of each branch
-        memory: wp.array2d(dtype=real),  # upper triangle of b_N - I of each branch
+        memory: wp.array2d(dtype=real),  # J - 1, then of each branch b_N - I and its lead [s]
         memory_next: wp.array2d(dtype=real),
     ):
         M = dt * L
         H_next = H + M + M * H
         tau = mat33()
         if wp.static(elastic):
-            tau = tau + corotated(H_next, coefficients[0, p], coefficients[1, p])
+            j = carried_volume(memory[0, p], M)
+            memory_next[0, p] = j
+            tau = tau + corotated(H_next, j, coefficients[0, p], coefficients[1, p])
         if wp.static(branches):
-            tau = tau + all_branches(p, dt, M, first, 0, coefficients, memory, memory_next)
+            tau = tau + all_branches(p, dt, M, first, row, coefficients, memory, memory_next)
         return H_next, tau
 
     return without_replay(advance)

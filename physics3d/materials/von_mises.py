@@ -19,7 +19,7 @@ from physics3d.checks import NotNegative, Positive
 from physics3d.materials.base import AbstractMaterial
 from physics3d.materials.parameters import ELASTIC, Values, lame, rows
 from physics3d.materials.strain_memory import carried_strain, hencky_energy, store_strain
-from physics3d.materials.tensors import log_strain
+from physics3d.materials.tensors import log_strain, scalars
 from physics3d.materials.tensors.replay import without_replay
 from physics3d.warp_types import matrix
 
@@ -64,8 +64,8 @@ class VonMises(AbstractMaterial):
 @functools.cache
 def _advance(real: type) -> wp.Function:
     mat33 = matrix(real)
-    relax, carried, store = log_strain.relax(real), carried_strain(real), store_strain(real)
-    root = real((2 / 3) ** 0.5)
+    rescale, carried, store = log_strain.rescale(real), carried_strain(real), store_strain(real)
+    expm1, root = scalars.expm1(real), real((2 / 3) ** 0.5)
 
     @wp.func(name=f"von_mises_return_{real.__name__}")
     def plastic_increment(dev: mat33, alpha: real, mu: real, sigma_y: real, h: real):
@@ -94,10 +94,10 @@ def _advance(real: type) -> wp.Function:
         M = dt * L
         mu = coefficients[0, p]
         X = carried(p, 0, M, memory)
-        eps, _unrelaxed = relax(X, real(0.0), real(0.0))
+        eps, _same = rescale(X, real(1.0), real(1.0), real(0.0), real(0.0))
         mean = wp.trace(eps) / real(3.0)
         gained, shrink = plastic_increment(eps - mean * one, memory[6, p], mu, coefficients[2, p], coefficients[3, p])
-        _half, X_next = relax(X, shrink, real(0.0))
+        _eps, X_next = rescale(X, real(1.0), real(1.0), expm1(-shrink), real(0.0))
         store(p, 0, X_next, memory_next)
         memory_next[6, p] = memory[6, p] + gained
         tau = real(2.0) * mu * wp.exp(-shrink) * (eps - mean * one) + real(3.0) * coefficients[1, p] * mean * one

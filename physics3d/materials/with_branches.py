@@ -34,6 +34,7 @@ class WithBranches(AbstractMaterial):
     solid: AbstractMaterial = field(default_factory=NeoHookean)
     branches: Annotated[int, Ge(1), Le(3)] = 1
     spring: Literal["hencky", "neo_hookean"] = "hencky"
+    flow: Literal["log_strain", "stress"] = "log_strain"
 
     RANGES = BRANCH  # and those of the solid
 
@@ -45,7 +46,7 @@ class WithBranches(AbstractMaterial):
 
     @property
     def _maxwell(self) -> Viscoelastic:
-        return Viscoelastic(elastic=False, branches=self.branches, spring=self.spring)
+        return Viscoelastic(elastic=False, branches=self.branches, spring=self.spring, flow=self.flow)
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -99,22 +100,26 @@ class WithBranches(AbstractMaterial):
 
     def advance(self, real: type) -> wp.Function:
         given = coefficient_rows(self.solid), self.solid.memory_rows
-        return _advance(self.solid.advance(real), *given, self.branches, self.spring, real)
+        return _advance(self.solid.advance(real), *given, self.branches, self.spring, self.flow, real)
 
 
 @functools.cache
-def _advance(solid: wp.Function, first: int, row: int, branches: int, spring: str, real: type) -> wp.Function:
+def _advance(
+    solid: wp.Function, first: int, row: int, branches: int, spring: str, flow: str, real: type
+) -> wp.Function:
     mat33 = matrix(real)
-    all_branches = maxwell_branches(branches, spring, real)
+    all_branches = maxwell_branches(branches, spring, flow, real)
 
-    @wp.func(name=f"{solid.key}_with_{branches}_{spring}")
+    @wp.func(name=f"{solid.key}_with_{branches}_{spring}_{flow}")
     def advance(
         p: int,
         dt: real,  # [s]
         L: mat33,  # velocity gradient [1/s]
         H: mat33,  # F - I
         coefficients: wp.array2d(dtype=real),  # of the solid, then mu_N, K_N [Pa], k_d, k_v [1/s] of each branch
-        memory: wp.array2d(dtype=real),  # of the solid, then upper triangle of b_N - I of each branch
+        memory: wp.array2d(
+            dtype=real
+        ),  # of the solid, then of each branch: upper triangle of b_N - I, by how much it is ahead [s]
         memory_next: wp.array2d(dtype=real),
     ):
         H_next, tau = solid(p, dt, L, H, coefficients, memory, memory_next)

@@ -18,49 +18,42 @@ FLOOR = 1e-5  # principal values of I + X below it (compression to 0.3 %) go on 
 
 
 @functools.cache
-def _relax_by_eigenvectors(real: type) -> wp.Function:
-    """`relaxed` at any strain."""
-    mat33 = matrix(real)
-    vec3 = vector(real)
+def _rescale_by_eigenvectors(real: type) -> wp.Function:
+    """`rescaled` at any strain."""
+    mat33, vec3 = matrix(real), vector(real)
     eigen_, expm1_, log1p_ = eigen(real), expm1(real), log1p_extended(real, FLOOR)
     floor = real(FLOOR)
 
-    @wp.func(name=f"relax_by_eigenvectors_{real.__name__}")
-    def relaxed(X: mat33, mu: real, K: real, d: real, v: real):
+    @wp.func(name=f"rescale_by_eigenvectors_{real.__name__}")
+    def rescale(X: mat33, shear: real, pressure: real, d: real, v: real):
         x, Q = eigen_(X)
         eps = real(0.5) * vec3(log1p_(x[0]), log1p_(x[1]), log1p_(x[2]))
         mean = (eps[0] + eps[1] + eps[2]) / real(3.0)
-        dh = expm1_(-real(0.5) * d)
-        vh = expm1_(-real(0.5) * v)
-        shear = real(2.0) * mu * (real(1.0) + dh)
-        pressure = real(3.0) * K * (real(1.0) + vh) * mean
-        df = real(2.0) * dh * (real(2.0) + dh)  # 2 expm1(-d)
-        vf = real(2.0) * vh * (real(2.0) + vh) * mean
-        stress = vec3()
+        scaled = vec3()
         change = vec3()
         for i in range(3):
             dev = eps[i] - mean
-            stress[i] = shear * dev + pressure
+            scaled[i] = shear * dev + pressure * mean
             before = x[i]
             if real(1.0) + x[i] < floor:
                 before = wp.exp(real(2.0) * eps[i]) - real(1.0)
-            change[i] = (real(1.0) + before) * expm1_(df * dev + vf) + before - x[i]
+            change[i] = (real(1.0) + before) * expm1_(real(2.0) * (d * dev + v * mean)) + before - x[i]
         Qt = wp.transpose(Q)
-        return Q * wp.diag(stress) * Qt, X + Q * wp.diag(change) * Qt
+        return Q * wp.diag(scaled) * Qt, X + Q * wp.diag(change) * Qt
 
-    return relaxed
+    return rescale
 
 
 @functools.cache
-def relaxed(real: type) -> wp.Function:
-    """relaxed(X, mu, K, d, v) -> (A, X_next): eps = 1/2 ln(I + X) halfway through its relaxation, weighted, and at its
-    end.
+def rescaled(real: type) -> wp.Function:
+    """rescaled(X, shear, pressure, d, v) -> (A, X_next): the logarithmic strain eps = 1/2 ln(I + X), its deviator and
+    its trace multiplied by two factors each.
 
-        A      = 2 mu e^{-d/2} dev eps + K e^{-v/2} tr(eps) I
-        X_next = exp(2 [e^{-d} dev eps + e^{-v} tr(eps)/3 I]) - I
+        A      = shear dev eps + pressure tr(eps)/3 I
+        X_next = exp(2 [(1 + d) dev eps + (1 + v) tr(eps)/3 I]) - I
 
-    A slow relaxation is an exact small increment of X, and none leaves X as it is. Not differentiable by itself, see
-    `adjoint_of_relaxed`.
+    d and v near zero are exact small increments of X, and d = v = 0 leaves X as it is. Not differentiable by itself:
+    `rescale` is, and who writes an adjoint of his own takes `adjoint_of_rescaled`.
 
     Unless stretches are very unequal, no eigenvectors: both results are quadratic polynomials of B (see `eigen`)
     through the values at three nodes t_i. The error is p^3 prod(t - t_i) times a third derivative, of the order of
@@ -69,13 +62,13 @@ def relaxed(real: type) -> wp.Function:
     mat33 = matrix(real)
     expm1_, log1p_ = expm1(real), log1p(real)
     separated_root_ = separated_root(real, 1 if real is wp.float32 else 2)
-    by_eigenvectors = _relax_by_eigenvectors(real)
+    by_eigenvectors = _rescale_by_eigenvectors(real)
     least = real(1e-18 if real is wp.float32 else 1e-150)
     third = real(1 / 3)
     apart = real(1e-6 if real is wp.float32 else 4e-16)
 
-    @wp.func(name=f"relaxed_{real.__name__}")
-    def relaxed(X: mat33, mu: real, K: real, d: real, v: real):
+    @wp.func(name=f"rescaled_{real.__name__}")
+    def rescaled(X: mat33, shear: real, pressure: real, d: real, v: real):
         m = third * (X[0, 0] + X[1, 1] + X[2, 2])
         a, b, c = X[0, 0] - m, X[1, 1] - m, X[2, 2] - m
         f, g, h = X[1, 2], X[0, 2], X[0, 1]
@@ -91,17 +84,14 @@ def relaxed(real: type) -> wp.Function:
         # values
         x0, x1, x2 = m + p * t0, m + p * t1, m + p * t2
         if real(1.0) + wp.min(x0, wp.min(x1, x2)) < wp.max(p, real(0.1)):
-            tau_far, X_far = by_eigenvectors(X, mu, K, d, v)
-            return tau_far, X_far
+            A_far, X_far = by_eigenvectors(X, shear, pressure, d, v)
+            return A_far, X_far
         e0, e1, e2 = real(0.5) * log1p_(x0), real(0.5) * log1p_(x1), real(0.5) * log1p_(x2)
         mean = third * (e0 + e1 + e2)
-        dh = expm1_(-real(0.5) * d)
-        vh = expm1_(-real(0.5) * v)
-        df = real(2.0) * dh * (real(2.0) + dh)  # 2 expm1(-d)
-        vf = real(2.0) * vh * (real(2.0) + vh) * mean
-        n0 = (real(1.0) + x0) * expm1_(df * (e0 - mean) + vf)
-        n1 = (real(1.0) + x1) * expm1_(df * (e1 - mean) + vf)
-        n2 = (real(1.0) + x2) * expm1_(df * (e2 - mean) + vf)
+        stretching, growth = real(2.0) * d, real(2.0) * v * mean
+        n0 = (real(1.0) + x0) * expm1_(stretching * (e0 - mean) + growth)
+        n1 = (real(1.0) + x1) * expm1_(stretching * (e1 - mean) + growth)
+        n2 = (real(1.0) + x2) * expm1_(stretching * (e2 - mean) + growth)
         # divided differences
         both = real(1.0) / ((t0 - t1) * (t0 - t2))
         r01, r02, r12 = both * (t0 - t2), both * (t0 - t1), real(0.5) / r
@@ -110,8 +100,7 @@ def relaxed(real: type) -> wp.Function:
         n012 = (n01 - (n0 - n2) * r02) * r12
         # powers of B
         sum01, product01 = t0 + t1, t0 * t1
-        shear = real(2.0) * mu * (real(1.0) + dh)
-        a_0 = shear * (e0 - mean - e01 * t0 + e012 * product01) + real(3.0) * K * (real(1.0) + vh) * mean
+        a_0 = shear * (e0 - mean - e01 * t0 + e012 * product01) + pressure * mean
         a_1, a_2 = shear * (e01 - e012 * sum01), shear * e012
         n_0, n_1 = n0 - n01 * t0 + n012 * product01, n01 - n012 * sum01
         aa, bb, cc = a * a + h * h + g * g, h * h + b * b + f * f, g * g + f * f + c * c
@@ -128,7 +117,7 @@ def relaxed(real: type) -> wp.Function:
             mat33(x_xx, x_xy, x_xz, x_xy, x_yy, x_yz, x_xz, x_yz, x_zz),
         )
 
-    return relaxed
+    return rescaled
 
 
 @functools.cache
@@ -178,29 +167,29 @@ def exp_slope(real: type) -> wp.Function:
 
 
 @functools.cache
-def adjoint_of_relaxed(real: type) -> wp.Function:
-    """adjoint(X, shear, bulk, d, v, adj_A, adj_X_next) -> (adj_X, dev eps : adj_A, dev eps : B, tr(eps)/3, tr adj_A,
-    tr B), of `relaxed` with shear = 2 mu e^{-d/2}, bulk = K e^{-v/2} and with the factors e^-d and e^-v as d and v.
+def adjoint_of_rescaled(real: type) -> wp.Function:
+    """adjoint(X, shear, pressure, d, v, adj_A, adj_X_next) -> (adj_X, dev eps : adj_A, tr(eps)/3 tr adj_A,
+    dev eps : B, tr(eps)/3 tr B), of `rescaled`: the last four are the adjoints of shear, pressure, d and v.
 
-    B = 2 (I + X_next) adj_X_next in principal axes is the adjoint of the strain that is left. From these numbers the
-    caller has the adjoints of the factors, and of what they are made of.
+    B = 2 (I + X_next) adj_X_next in principal axes is the adjoint of the strain that is of_dev.
     """
     mat33, vec3 = matrix(real), vector(real)
     eigen_, log1p_ = eigen(real), log1p_extended(real, FLOOR)
     log_slope_, exp_slope_ = log_slope(real), exp_slope(real)
     floor = real(FLOOR)
 
-    @wp.func(name=f"adjoint_of_relaxed_{real.__name__}")
-    def adjoint(X: mat33, shear: real, bulk: real, d: real, v: real, adj_A: mat33, adj_X_next: mat33):
+    @wp.func(name=f"adjoint_of_rescaled_{real.__name__}")
+    def adjoint(X: mat33, shear: real, pressure: real, d: real, v: real, adj_A: mat33, adj_X_next: mat33):
         x, Q = eigen_(X)
         l = vec3(log1p_(x[0]), log1p_(x[1]), log1p_(x[2]))
         mean = (l[0] + l[1] + l[2]) / real(6.0)
         dev = vec3(real(0.5) * l[0] - mean, real(0.5) * l[1] - mean, real(0.5) * l[2] - mean)
+        of_dev, of_mean = real(1.0) + d, real(1.0) + v  # factors of deviator and trace
         # ln(1 + next) and its root
         y = vec3(
-            real(2.0) * (d * dev[0] + v * mean),
-            real(2.0) * (d * dev[1] + v * mean),
-            real(2.0) * (d * dev[2] + v * mean),
+            real(2.0) * (of_dev * dev[0] + of_mean * mean),
+            real(2.0) * (of_dev * dev[1] + of_mean * mean),
+            real(2.0) * (of_dev * dev[2] + of_mean * mean),
         )
         root = vec3(wp.exp(real(0.5) * y[0]), wp.exp(real(0.5) * y[1]), wp.exp(real(0.5) * y[2]))
         Qt = wp.transpose(Q)
@@ -210,42 +199,40 @@ def adjoint_of_relaxed(real: type) -> wp.Function:
         b = real(2.0) * vec3(root[0] * root[0] * B[0, 0], root[1] * root[1] * B[1, 1], root[2] * root[2] * B[2, 2])
         a_sum = a[0] + a[1] + a[2]
         b_sum = b[0] + b[1] + b[2]
-        adj_mean = bulk * a_sum + (v * b_sum - shear * a_sum - d * b_sum) / real(3.0)
+        adj_mean = ((pressure - shear) * a_sum + (of_mean - of_dev) * b_sum) / real(3.0)
         T = mat33()
         for i in range(3):
-            T[i, i] = real(0.5) * (shear * a[i] + d * b[i] + adj_mean) / wp.max(real(1.0) + x[i], floor)
+            T[i, i] = real(0.5) * (shear * a[i] + of_dev * b[i] + adj_mean) / wp.max(real(1.0) + x[i], floor)
         for i in range(3):
             j = (i + 1) % 3
             slope = real(0.5) * log_slope_(x[i], x[j], l[i], l[j])
             exp_ij = exp_slope_(y[i], y[j], root[i], root[j])
-            T_ij = slope * (real(0.5) * shear * (A[i, j] + A[j, i]) + d * exp_ij * (B[i, j] + B[j, i]))
+            T_ij = slope * (real(0.5) * shear * (A[i, j] + A[j, i]) + of_dev * exp_ij * (B[i, j] + B[j, i]))
             T[i, j] = T_ij
             T[j, i] = T_ij
-        return Q * (T * Qt), wp.dot(dev, a), wp.dot(dev, b), mean, a_sum, b_sum
+        return Q * (T * Qt), wp.dot(dev, a), mean * a_sum, wp.dot(dev, b), mean * b_sum
 
     return adjoint
 
 
 @functools.cache
-def relax(real: type) -> wp.Function:
-    """relax(X, d, v) -> (e^{-d/2} dev eps + e^{-v/2} tr(eps)/3 I, X_next): `relaxed` of 2 mu = 3 K = 1, with its
-    adjoint."""
+def rescale(real: type) -> wp.Function:
+    """`rescaled` with its adjoint."""
     mat33 = matrix(real)
-    relaxed_, adjoint = relaxed(real), adjoint_of_relaxed(real)
-    half, third = real(1 / 2), real(1 / 3)
+    rescaled_, adjoint = rescaled(real), adjoint_of_rescaled(real)
 
-    @wp.func(name=f"relax_{real.__name__}")
-    def relax(X: mat33, d: real, v: real):
-        eps_half, X_next = relaxed_(X, half, third, d, v)
-        return eps_half, X_next
+    @wp.func(name=f"rescale_{real.__name__}")
+    def rescale(X: mat33, shear: real, pressure: real, d: real, v: real):
+        A, X_next = rescaled_(X, shear, pressure, d, v)
+        return A, X_next
 
-    @wp.func_grad(relax)
-    def adj_relax(X: mat33, d: real, v: real, adj_eps_half: mat33, adj_X_next: mat33):
-        dh, vh = wp.exp(-real(0.5) * d), wp.exp(-real(0.5) * v)
-        df, vf = dh * dh, vh * vh
-        adj_X, dev_a, dev_b, mean, a, b = adjoint(X, dh, third * vh, df, vf, adj_eps_half, adj_X_next)
+    @wp.func_grad(rescale)
+    def adj_rescale(X: mat33, shear: real, pressure: real, d: real, v: real, adj_A: mat33, adj_X_next: mat33):
+        adj_X, adj_shear, adj_pressure, adj_d, adj_v = adjoint(X, shear, pressure, d, v, adj_A, adj_X_next)
         wp.adjoint[X] += adj_X
-        wp.adjoint[d] += -real(0.5) * dh * dev_a - df * dev_b
-        wp.adjoint[v] += -real(0.5) * vh * mean * a - vf * mean * b
+        wp.adjoint[shear] += adj_shear
+        wp.adjoint[pressure] += adj_pressure
+        wp.adjoint[d] += adj_d
+        wp.adjoint[v] += adj_v
 
-    return relax
+    return rescale

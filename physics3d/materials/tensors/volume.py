@@ -51,6 +51,39 @@ def cofactor(real: type) -> wp.Function:
 
 
 @functools.cache
+def carried_volume(real: type) -> wp.Function:
+    """carried(j, M) -> J - 1 after the increment I + M, from j = J - 1 before it.
+
+    J integrated by itself: taken from an F of float32 it would be off by 1e-7, which a bulk modulus of a thousand times
+    the shear modulus makes a stress of the order of the others."""
+    mat33, change = matrix(real), volume_change(real)
+
+    @wp.func(name=f"carried_volume_{real.__name__}")
+    def carried(j: real, M: mat33):
+        return j + (real(1.0) + j) * change(M)
+
+    return carried
+
+
+LEAST_J = 1e-4  # below it the isochoric part of a strain is taken at this volume: finite for inverted elements
+
+
+@functools.cache
+def isochoric(real: type) -> wp.Function:
+    """isochoric(X, j) -> b~ - I = J^(-2/3) (I + X) - I, of X = b - I and j = J - 1."""
+    mat33 = matrix(real)
+    log1p_, expm1_ = log1p(real), expm1(real)
+    least = real(LEAST_J - 1)
+
+    @wp.func(name=f"isochoric_{real.__name__}")
+    def isochoric(X: mat33, j: real):
+        scale = expm1_(real(-2.0 / 3.0) * log1p_(wp.max(j, least)))
+        return X + scale * (wp.identity(n=3, dtype=real) + X)
+
+    return isochoric
+
+
+@functools.cache
 def log_det(real: type) -> wp.Function:
     """ln det(I + X) of a positive semidefinite I + X, its tangent below det = 1e-12 (all lengths a hundredth), or below
     what rounding leaves of the determinant of very unequal stretches."""
@@ -112,3 +145,15 @@ def unimodular_inverse(real: type) -> wp.Function:
 def determinant(A: Float[Tensor, "n 3 3"]) -> Float[Tensor, " n"]:
     """Of many matrices at once, which torch takes one by one."""
     return (torch.linalg.cross(A[:, 0], A[:, 1]) * A[:, 2]).sum(1)
+
+
+def isochoric_strain(H: Float[Tensor, "n 3 3"], J: Float[Tensor, " n"]) -> Float[Tensor, "n 3 3"]:
+    """b~ - I of many F = I + H of the volume J, as `isochoric`."""
+    X = H + H.mT + H @ H.mT
+    scale = torch.expm1(-2 / 3 * J.clamp(min=LEAST_J).log())[:, None, None]
+    return X + scale * (torch.eye(3, dtype=H.dtype, device=H.device) + X)
+
+
+def volumetric_energy(j: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """[(J^2 - 1)/2 - ln J]/2 of j = J - 1, per bulk modulus; its stress is (J^2 - 1)/2."""
+    return (j + j**2 / 2 - torch.log1p(j.clamp(min=1e-30 - 1))) / 2
