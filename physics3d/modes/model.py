@@ -167,7 +167,10 @@ def model(
     log.info(
         f"{len(matter.position)} pieces, {splines.count} splines {1e3 * splines.H:.3g} mm apart, {len(weight)} points"
     )
-    swings = exact > 1e3 * shift  # no rigid motion
+    # Rayleigh's quotients: what was added to keep the matrix regular changes shapes a little, and these not at all
+    elastic = K + _three(permanent)
+    exact = np.maximum(np.einsum("nm,nm->m", shapes, elastic @ shapes), 0.0)
+    swings = np.ones(len(exact), bool) if held else exact > 1e-3 * exact[6]  # no rigid motion
     fields = [shapes[:, swings]]
     sources = [*load_fields] + ([first_moment] if any(world.gravity) else [])
     responses = _responses((K + _three(rest) + shift * M).tocsr(), sources)

@@ -22,7 +22,7 @@ from physics3d.materials.base import AbstractMaterial
 from physics3d.modes.stress import Points
 
 STUCK, RELAXED = 1e-12, 1e12  # [s]
-FAINT = 1e-12  # of the stiffness of a function full of matter
+FAINT = 1e-10  # of the stiffness of a function full of matter
 
 
 @dataclass(frozen=True, kw_only=True)
