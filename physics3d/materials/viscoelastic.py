@@ -142,6 +142,14 @@ class Viscoelastic(AbstractMaterial):
         return _advance(self.branches, self.elastic, self.spring, self.flow, real)
 
 
+_NEAR = 1.0  # relaxation times: after a longer step the strain is stored as it is, after a shorter one ahead
+
+
+def _grown(x: Tensor) -> Tensor:
+    """1/g = (e^x - 1)/x (`tensors/decay.py`)."""
+    return torch.where(x > 0, torch.expm1(x) / x.clamp(min=1e-30), 1.0)
+
+
 @functools.cache
 def hencky_branch(real: type) -> tuple[wp.Function, wp.Function, wp.Function]:
     """A Hencky spring in series with a dash-pot, one step of dt: (prepare, relax, ahead), eps = 1/2 ln(I + X).
