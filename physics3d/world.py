@@ -46,6 +46,8 @@ class World:
     velocity: Vector = (0.0, 0.0, 0.0)  # of the body at the start [m/s]; learning may refine it
     boundaries: tuple[AbstractBoundary, ...] = ()
     damping: NotNegative = 0.0  # rate at which all velocities decay [1/s]
+    # modes: held or free bodies that touch nothing; auto: modes where they serve, else the grid
+    solver: Literal["grid", "modes", "auto"] = "grid"
     cfl: Factor = 0.5  # cells a wave crosses in one automatic substep
     dt: Positive | None = None  # substep [s]; None: from the speed of sound and of the particles
     # explicit: follows every wave; implicit: damps those faster than dt; auto: the cheaper one

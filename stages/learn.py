@@ -79,9 +79,7 @@ class Learn:
 
     def __post_init__(self):
         require_fields(self, "learn")
-        field = self.field(self.world.estimate(), speed=1.0)
-        if self.search:
-            self.directions(field)
+        self.field(self.world.estimate(), speed=1.0)
 
     def fits(self, outline: Outline) -> None:
         """Raise ValueError if a take of this outline is too short, as far as that is known."""
@@ -112,6 +110,7 @@ class Learn:
             indices,
             image_scale=self.image_scale,
             device=self.device,
+            log=log,
         )
         log.info(
             f"learning {', '.join(field.names)} from take {take.name}: {len(indices)} frames over {seconds:.2f} s, "
@@ -188,25 +187,15 @@ class Learn:
         size = body.position.amax(0) - body.position.amin(0)
         return float(size.norm()) / seconds
 
-    def directions(self, field: GlobalField) -> Tensor:
-        """1 for the components of theta that are a stiffness, else 0. Raises ValueError if none is."""
+    def searched(self, chain: Chain, field: GlobalField, log: Log) -> Tensor:
+        """The best of the factors on all moduli together; the start if no modulus is learned, which is said."""
         directions = torch.tensor([float(name.split("+")[0].endswith("modulus")) for name in field.names]).double()
         if not directions.any():
-            raise ValueError(
-                f"learn.search = {self.search} looks for a stiffness, but no modulus is learned; set it to 0"
-            )
-        return directions
-
-    def searched(self, chain: Chain, field: GlobalField, log: Log) -> Tensor:
+            log.info(f"no coarse search over the stiffness: no modulus is learned, only {', '.join(field.names)}")
+            return field.zero()
         limit = math.log(self.search_span)
-        return search(
-            chain,
-            field,
-            self.directions(field),
-            np.linspace(-limit, limit, self.search).tolist(),
-            seed=self.seed,
-            log=log,
-        )
+        offsets = np.linspace(-limit, limit, self.search).tolist()
+        return search(chain, field, directions, offsets, seed=self.seed, log=log)
 
     def history(self, field: GlobalField, history: dict[str, list[float]]) -> dict[str, list[float]]:
         """Components of theta -> physical values per step."""

@@ -12,7 +12,7 @@ from physics3d.checks import Device, Frames, Keys, Rate, require_fields
 from physics3d.filling.body import Body
 from physics3d.filling.in_world import look_ahead
 from physics3d.log import Log
-from physics3d.mpm.rollout import rollout
+from physics3d.solver import motion_of
 from physics3d.trajectory import Trajectory
 from physics3d.world import Estimate, World
 
@@ -45,17 +45,20 @@ class Simulate:
         excitation = excited(self.excitation, self.force)
         look_ahead(body, self.world, excitation, log)
         with torch.no_grad():
-            trajectory = rollout(
+            part = lambda values: self.world.material.per_part(values, body.part, body.parts)
+            motion = motion_of(
                 self.world,
-                self.world.material.per_part(estimate.parameters, body.part, body.parts),
                 body.position,
                 body.volume,
-                velocity=estimate.velocity,
                 excitation=(*body.held, *excitation),
-                frames=self.frames,
-                frame_dt=1 / self.fps,
+                part=part,
+                matter=body.matter,
                 device=self.device,
                 log=log,
+            )
+            parameters = part(estimate.parameters)
+            trajectory = motion(
+                parameters, velocity=estimate.velocity, frames=self.frames, frame_dt=1 / self.fps, log=log
             )
         trajectory = _on_cpu(trajectory)
         for name, curve in trajectory.health.items():

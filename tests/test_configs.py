@@ -28,6 +28,8 @@ CASES += [
     for scene in choices("scene")
     # an ablation's one material cannot be that of several parts
     if scene != "carnation_parts" or method in ("physics3d", "physgaussian", "without_filling")
+    # and the bird is learned by a modulus that a fluid has not
+    if (method, scene) != ("without_elastoplastic", "bird")
 ]
 
 
@@ -96,21 +98,19 @@ def test_the_page_shows_every_field_and_the_defaults_it_departs_from(choice):
 # where the page is not the class: the page is for ten minutes on two cores, the class for no scene in particular
 TUNED = {
     "reconstruct.iterations", "reconstruct.max_gaussians", "learn.steps", "learn.polish", "learn.learning_rate",
-    "learn.search", "learn.search_span", "learn.ties", "segment.prompts", "fill.sheet_thickness", "simulate.excitation",
-    "simulate.force", "evaluate.excitation", "evaluate.force", "world.gravity", "world.boundaries",
+    "learn.search", "learn.search_span", "simulate.force",
 }  # fmt: skip
 
 
 def test_defaults_of_the_page_are_those_of_the_class():
-    config, _ = composed(())
-    for key, tree in named(config):
-        if key.split(".")[0] not in (*STAGES, "world") or re.search(r"source|material|\.world", key):
-            continue
+    from omegaconf import OmegaConf
+
+    for key, tree in named(OmegaConf.to_container(OmegaConf.load(CONF / "config.yaml"), resolve=False)):
         module, _, name = tree["_target_"].rpartition(".")
         for field in dataclasses.fields(getattr(__import__(module, fromlist=[name]), name)):
             where = f"{key}.{field.name}"
-            if field.default is not dataclasses.MISSING and where not in TUNED and field.name != "device":
-                value = tree[field.name]
+            value = tree[field.name]
+            if field.default is not dataclasses.MISSING and where not in TUNED and "${" not in str(value):
                 assert (tuple(value) if isinstance(value, list) else value) == field.default, where
 
 

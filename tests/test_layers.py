@@ -19,6 +19,7 @@ BOTTOM = (
     "physics3d.warp_start",
     "physics3d.clusters",
     "physics3d.trajectory",
+    "physics3d.matter",
 )
 # what each room of the library may use beside itself and the bottom; rooms that are not listed may use all of these
 ROOMS = {

@@ -8,6 +8,7 @@ from torch import Tensor
 from physics3d.artifact import AbstractArtifact, require_finite
 from physics3d.boundaries.held_particles import HeldParticles
 from physics3d.gaussians.embedding import Embedding
+from physics3d.matter import Matter
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,6 +20,7 @@ class Body(AbstractArtifact):
     spacing: float  # distance between neighbours [m]
     embedding: Embedding  # how the moving Gaussians ride on the particles
     attached: Bool[Tensor, " p"] | None = None  # beside something static, which holds them there; None: nothing is
+    matter: Matter | None = None  # of which pieces the particles stand for; None: cubes around them
     parts: tuple[str, ...] = ()  # names of the segmentation's parts; empty: they have none
 
     @property
@@ -48,5 +50,7 @@ class Body(AbstractArtifact):
             raise ValueError(
                 f"Body.volume: {int((self.volume <= 0).sum())} particles without volume; each must be > 0 m^3"
             )
+        if self.matter is not None:
+            self.matter.check()
         if not self.spacing > 0:
             raise ValueError(f"Body.spacing is {self.spacing:g} m, must be > 0")

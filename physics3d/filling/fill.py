@@ -28,7 +28,7 @@ from physics3d.filling.cells import solid_cells
 from physics3d.filling.ground import Ground, ground
 from physics3d.filling.pieces import ISOLATED, join_pieces
 from physics3d.filling.seen import LIMB, Seen, seen
-from physics3d.filling.sheets import sheet
+from physics3d.filling.sheets import disc_moment, sheet
 from physics3d.filling.solids import AbstractSolid
 from physics3d.filling.surface import Surface, over_discs, sample_surface
 from physics3d.gaussians.cameras import Camera
@@ -36,6 +36,7 @@ from physics3d.gaussians.embedding import embed
 from physics3d.gaussians.floaters import lonely
 from physics3d.gaussians.model import Gaussians
 from physics3d.log import Log
+from physics3d.matter import of_owners, with_particles
 
 MOST_CELLS = 160  # along one side of the lattice
 FLOATING = 3.0  # standard deviations by which a Gaussian is farther from its neighbours than all are
@@ -80,7 +81,7 @@ def fill(
     view, below = _look(gaussians, label, shown, cameras, spacing=spacing, opacity=opacity, log=log)
     surface, deviation = sample_surface(shown, spacing, beside=static, view=view, below=below, log=log)
     inside = _bounded(solid.inside(surface, spacing), view, below, spacing)
-    position, volume = solid_cells(inside, surface.point, spacing)
+    position, volume, matter = solid_cells(inside, surface.point, spacing)
     inner = cKDTree(surface.point).query(position)[0] > spacing if len(position) else np.zeros(0, bool)
 
     bare = _uncovered(surface, deviation, position, view, spacing)
@@ -94,15 +95,23 @@ def fill(
         + (thin if len(flat) else "no thin part")
     )
     if not interior:
+        matter = of_owners(matter, ~inner)
         position, volume, inner = position[~inner], volume[~inner], inner[~inner]
         log.info(f"interior left out: a shell of {volume.sum():.4g} m^3 stays")
     if len(flat):
+        side = surface.normal[bare][cKDTree(surface.point[bare]).query(flat)[1]]
+        moment = disc_moment(side, area, thickness)
+        matter = with_particles(matter, flat, area * thickness, moment, len(position))
         position, volume = np.concatenate([position, flat]), np.concatenate([volume, area * thickness])
         inner = np.concatenate([inner, np.zeros(len(flat), bool)])
 
     _, nearest = cKDTree(shown.mean.double().numpy()).query(position)
     part = (label[which][reliable][torch.from_numpy(nearest)] - 1).numpy()
     keep, bridge, bridge_part = join_pieces(position, volume, part, spacing, isolated, drop_pieces_below, log)
+    cubes = np.tile(spacing**2 / 12 * np.eye(3), (len(bridge), 1, 1))
+    matter = of_owners(matter, keep)
+    if len(bridge):
+        matter = with_particles(matter, bridge, np.full(len(bridge), spacing**3), cubes, int(keep.sum()))
     position = np.concatenate([position[keep], bridge])
     volume = np.concatenate([volume[keep], np.full(len(bridge), spacing**3)])
     inner = np.concatenate([inner[keep], np.zeros(len(bridge), bool)])
@@ -118,6 +127,7 @@ def fill(
         spacing=float(spacing),
         embedding=embed(moving.mean.to(torch.float32), which, placed, spacing, parts=(label[which] - 1, of)),
         attached=attached,
+        matter=matter,
     )
 
 

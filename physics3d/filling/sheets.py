@@ -23,6 +23,12 @@ def sheet(point: np.ndarray, normal: np.ndarray, spacing: float) -> tuple[np.nda
     return position, np.where(lonely, (spacing / 2) ** 2, area)
 
 
+def disc_moment(normal: np.ndarray, area: np.ndarray, thickness: float) -> np.ndarray:
+    """Second moments [s, 3, 3] m^2, per volume, of plates with these normals [s, 3], areas [s] m^2 and thickness [m]."""
+    across = normal[:, :, None] * normal[:, None, :]
+    return thickness**2 / 12 * across + area[:, None, None] / 12 * (np.eye(3) - across)
+
+
 def sample_area(point: np.ndarray, normal: np.ndarray, spacing: float, tree: cKDTree) -> np.ndarray:
     """Area [m^2] of each sample: a third of the Delaunay triangles around it, among neighbours in its layer."""
     area = np.zeros(len(point))

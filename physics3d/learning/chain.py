@@ -11,9 +11,9 @@ from physics3d.gaussians.model import Gaussians
 from physics3d.learning.fields import GlobalField
 from physics3d.learning.loss import Chain
 from physics3d.log import Log
-from physics3d.mpm.rollout import rollout
 from physics3d.priors.base import AbstractPrior
 from physics3d.scenes.base import Capture, Take
+from physics3d.solver import motion_of
 from physics3d.world import World
 
 
@@ -29,6 +29,7 @@ def chain_of(
     *,
     image_scale: float,
     device: str,
+    log: Log,
 ) -> Chain:
     """Of the frames `indices`, ascending from 0, of the cameras of the take that are not held out.
 
@@ -51,19 +52,21 @@ def chain_of(
     step = math.gcd(*indices.tolist())
     at = (indices // step).tolist()
 
+    part = lambda values: world.material.per_part(values, body.part, body.parts)
+    motion = motion_of(
+        world,
+        rest,
+        volume,
+        excitation=(*body.held, *take.excitation),
+        part=part,
+        matter=body.matter,
+        device=device,
+        log=log,
+    )
+
     def simulate(theta: Tensor):
-        return rollout(
-            world,
-            world.material.per_part(field.parameters(theta), body.part, body.parts),
-            rest,
-            volume,
-            velocity=field.velocity(theta),
-            excitation=(*body.held, *take.excitation),
-            frames=at[-1] + 1,
-            frame_dt=step / take.fps,
-            device=device,
-            log=Log(None),
-        )
+        timing = dict(frames=at[-1] + 1, frame_dt=step / take.fps, log=Log(None))
+        return motion(part(field.parameters(theta)), velocity=field.velocity(theta), **timing)
 
     def render(motion, view: int, frames: Tensor) -> Tensor:
         draw = lambda x, F: (

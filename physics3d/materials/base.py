@@ -35,6 +35,11 @@ class AbstractMaterial(abc.ABC):
         """Parameters of an everyday sample: where one may start, and what the tests check the laws on."""
 
     @property
+    def recovers(self) -> bool:
+        """Whether a body of it comes back to its shape, whatever was done to it: no plastic strain, no flow."""
+        return False
+
+    @property
     def memory_rows(self) -> int:
         """Internal variables per particle."""
         return 0

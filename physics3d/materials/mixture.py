@@ -50,6 +50,10 @@ class Mixture(AbstractMaterial):
         return {f"{part}.{name}": x for part, m in self.materials.items() for name, x in m.example.items()}
 
     @property
+    def recovers(self) -> bool:
+        return all(m.recovers for m in self.materials.values())
+
+    @property
     def memory_rows(self) -> int:
         return max(m.memory_rows for m in self.materials.values())
 

@@ -37,6 +37,10 @@ class MooneyRivlin(AbstractMaterial):
         return {"first_modulus": 1.5e5, "second_modulus": 1.5e4, "bulk_modulus": 5e6}  # vulcanised rubber, nu = 0.467
 
     @property
+    def recovers(self) -> bool:
+        return True
+
+    @property
     def memory_rows(self) -> int:
         return 1
 

@@ -45,6 +45,10 @@ class NearlyIncompressible(AbstractMaterial):
         return {"youngs_modulus": 1e5, "poissons_ratio": 0.49}  # rubber
 
     @property
+    def recovers(self) -> bool:
+        return True
+
+    @property
     def memory_rows(self) -> int:
         return 1
 

@@ -44,6 +44,10 @@ class NeoHookean(AbstractMaterial):
     def memory_rows(self) -> int:
         return 1
 
+    @property
+    def recovers(self) -> bool:
+        return True
+
     def coefficients(self, values: Values) -> Float[Tensor, "2 n"]:
         self.check_parameters(values)
         return rows(*lame(values["youngs_modulus"], values["poissons_ratio"]))

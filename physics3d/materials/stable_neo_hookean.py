@@ -39,6 +39,10 @@ class StableNeoHookean(AbstractMaterial):
         return {"youngs_modulus": 5e4, "poissons_ratio": 0.45}  # flesh
 
     @property
+    def recovers(self) -> bool:
+        return True
+
+    @property
     def memory_rows(self) -> int:
         return 1
 

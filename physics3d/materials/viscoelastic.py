@@ -90,6 +90,10 @@ class Viscoelastic(AbstractMaterial):
         return ("", "_2", "_3")[: self.branches]
 
     @property
+    def recovers(self) -> bool:
+        return self.elastic
+
+    @property
     def memory_rows(self) -> int:
         return self._first_memory + 7 * self.branches
 

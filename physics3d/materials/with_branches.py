@@ -57,6 +57,10 @@ class WithBranches(AbstractMaterial):
         return self.solid.example | self._maxwell.example
 
     @property
+    def recovers(self) -> bool:
+        return self.solid.recovers
+
+    @property
     def memory_rows(self) -> int:
         return self.solid.memory_rows + self._maxwell.memory_rows
 

@@ -45,6 +45,10 @@ class Yeoh(AbstractMaterial):
         return {"linear_modulus": 2e5, "quadratic_coefficient": -2e3, "cubic_modulus": 1e2, "bulk_modulus": 6e6}
 
     @property
+    def recovers(self) -> bool:
+        return True
+
+    @property
     def memory_rows(self) -> int:
         return 2
 

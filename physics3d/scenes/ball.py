@@ -23,6 +23,7 @@ from physics3d.checks import (
     Positive,
     Rate,
     Seed,
+    require_fields,
 )
 from physics3d.materials.viscoelastic import Viscoelastic
 from physics3d.scenes.base import AbstractSource, Capture, Footage, Outline
@@ -71,6 +72,7 @@ class BallTwin(AbstractSource):
         return Outline(name="ball", names=view_names(self.views), mattes=True, takes=takes)
 
     def __call__(self, *, log) -> Capture:
+        require_fields(self, "source")
         centre = (0.0, 0.0, RADIUS + self.gap)
         mesh = checkered_ball(centre)
         light = Light(sun=(1.0, 0.96, 0.9), backdrop=(1.0, 1.0, 1.0))

@@ -27,6 +27,7 @@ from physics3d.checks import (
     Positive,
     Rate,
     Seed,
+    require_fields,
 )
 from physics3d.gaussians.cameras import Camera
 from physics3d.materials.viscoelastic import Viscoelastic
@@ -74,6 +75,7 @@ class CarnationTwin(AbstractSource):
         return Outline(name="carnation", names=view_names(self.views), mattes=False, takes=takes)
 
     def __call__(self, *, log) -> Capture:
+        require_fields(self, "source")
         meshes, solids = plant(self.seed)
         light = Light(backdrop=(0.80, 0.83, 0.86))
         studio = Studio([*meshes, *surroundings(self.seed)], light, openness_rays=24, seed=self.seed)

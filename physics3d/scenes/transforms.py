@@ -4,11 +4,11 @@
     {"fl_x": px, "fl_y": px, "cx": px, "cy": px, "w": px, "h": px, "k1": ..., "p1": ..., "frames": [...]}
 
 What describes the lens may also stand in a frame and holds there. transform_matrix is camera-to-world with OpenGL
-camera axes (x right, y up, z backward). Pictures are undistorted as they are read: k1, k2, p1, p2 are OpenCV's, k3 and k4 the
-factors of r^6 and r^8 (Brown's, as nerfstudio computes them); with "camera_model": "FULL_OPENCV", or with k5 or k6, k4,
-k5 and k6 are OpenCV's denominator. A picture's `mask_path` is black where it shows nothing of the object and is taken
-as its matte. Points of structure from motion are taken from `ply_file_path`, or from points3D.npz (xyz, rgb) beside the
-file. Mildenhall et al. 2020; docs.nerf.studio, "data conventions".
+camera axes (x right, y up, z backward). Pictures are undistorted as they are read: k1, k2, p1, p2 are OpenCV's, k3 and
+k4 the factors of r^6 and r^8 (Brown's, as nerfstudio computes them); with "camera_model": "FULL_OPENCV", or with k5 or
+k6, k4, k5 and k6 are OpenCV's denominator. A picture's `mask_path` is black where it shows nothing of the object and is
+taken as its matte. Points of structure from motion are taken from `ply_file_path`, or from points3D.npz (xyz, rgb)
+beside the file. Mildenhall et al. 2020; docs.nerf.studio, "data conventions".
 """
 
 import json

@@ -156,9 +156,14 @@ def _copies(
     from PIL import Image
 
     called: dict[str, str] = {}
+    with_matte, without = [], []
     for path in log.progress(photographs_below(folder, log), "reading photographs"):
         picture = read_picture(path).shown()
-        matte = picture.alpha if picture.alpha is not None and picture.alpha.min() < 1 else None
+        matte = picture.alpha
+        if matte is None:
+            without.append(path.name)
+        elif matte.min() < 1:
+            with_matte.append(path.name)
         name = re.sub(r"\s", "_", "__".join(path.relative_to(folder).with_suffix("").parts))
         name += ".jpg" if matte is None else ".png"
         if name in called:
@@ -172,6 +177,11 @@ def _copies(
             array[array[..., 3] == 0, :3] = np.round(255 * np.asarray(background)).astype(np.uint8)
             copy = Image.fromarray(array)
         copy.save(target / name, quality=97, exif=_without_turn(path))
+    if with_matte and without:
+        raise ValueError(
+            f"{without[0]} has no alpha channel, but {with_matte[0]} has one that hides something; give all "
+            "photographs a matte or none"
+        )
     return called
 
 

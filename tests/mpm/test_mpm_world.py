@@ -75,7 +75,7 @@ def test_senseless_parameters_are_refused(name, value):
         simulate(parameters=tensors(soft_world().start | {name: value}))
 
 
-def test_senseless_bodies_are_refused():
+def test_senseless_bodies_are_refused(unchecked):
     for position, volume, says in (
         (torch.where(torch.arange(64)[:, None] == 3, torch.nan, POSITION), VOLUME, "position holds 3 non-finite"),
         (POSITION, torch.zeros_like(VOLUME), "volume of 64 of 64 particles"),

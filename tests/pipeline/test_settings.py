@@ -36,7 +36,7 @@ from pipeline.settings import CONF, GROUPS, SettingsError, choices, compose
         ("world.material=3", r"world\.material is 3; take a mapping with the _target_ of a AbstractMaterial"),
         ("scene.source._target_=physics3d.scenes.ply.PlyScen", r"did you mean PlyScene\?"),
         (
-            "prior._target_=physics3d.gaussians.densify.Adaptive",
+            "prior._target_=physics3d.gaussians.densification.adaptive.Adaptive",
             r"prior\._target_ is .*; take a class that is a AbstractPrior",
         ),
         # what belongs together

@@ -223,7 +223,12 @@ def test_copies_are_upright_keep_their_focal_length_and_hide_what_alpha_hides(tm
     hidden = np.arange(80)[None].repeat(60, 0) < 40
     red = np.where(hidden[..., None], np.uint8([200, 0, 0]), ramp)
     Image.fromarray(np.dstack([red, np.where(hidden, 0, 255).astype(np.uint8)])).save(tmp_path / "in/b.png")
-    called = _copies(tmp_path / "in", tmp_path / "out", 1000, (0.0, 1.0, 0.0), Log(None))
+    called: dict[str, str] = {}
+    for kind in ("jpg", "png"):
+        (tmp_path / kind).mkdir()
+        for file in (tmp_path / "in").glob(f"*.{kind}"):
+            shutil.copy(file, tmp_path / kind)
+        called |= _copies(tmp_path / kind, tmp_path / "out", 1000, (0.0, 1.0, 0.0), Log(None))
     assert called == {"photo_one.jpg": "photo one.jpg", "b.png": "b.png"}
     with Image.open(tmp_path / "out/photo_one.jpg") as copy:
         assert copy.size == (60, 80) and copy.getexif().get(0x0112, 1) == 1
@@ -231,6 +236,18 @@ def test_copies_are_upright_keep_their_focal_length_and_hide_what_alpha_hides(tm
         assert np.diff(np.asarray(copy.convert("L")).astype(float).mean(1)[::8]).min() > 0  # columns became rows
     array = np.asarray(Image.open(tmp_path / "out/b.png"))
     assert (array[:, :40] == (0, 255, 0, 0)).all() and (array[:, 40:, :3] == ramp[:, 40:]).all()
+
+
+def test_mattes_of_some_photographs_only_are_refused_before_anything_is_matched(tmp_path, rng):
+    from PIL import Image
+
+    (tmp_path / "out").mkdir()
+    pictures(tmp_path, rng, 2)
+    Image.new("RGBA", (320, 240), (0, 0, 0, 255)).save(tmp_path / "screenshot.png")
+    _copies(tmp_path, tmp_path / "out", 1000, (1.0, 1.0, 1.0), Log(None))  # hides nothing: no matte
+    Image.new("RGBA", (320, 240), (0, 0, 0, 0)).save(tmp_path / "cut_out.png")
+    with pytest.raises(ValueError, match=r"0\.jpg has no alpha channel, but cut_out\.png"):
+        _copies(tmp_path, tmp_path / "out", 1000, (1.0, 1.0, 1.0), Log(None))
 
 
 def seen(R: np.ndarray, t: np.ndarray, points: np.ndarray, f: float) -> np.ndarray:

@@ -73,6 +73,13 @@ def test_no_steps_no_search_leaves_the_start(clip):
     assert float(estimate.parameters["youngs_modulus"]) == pytest.approx(7e3)
 
 
+def test_without_a_modulus_there_is_no_search_for_a_stiffness_and_that_is_said(clip, tmp_path):
+    stage = learner(START, ("poissons_ratio",), search=3, steps=0)
+    estimate = stage(clip, *bar(), log=Log(tmp_path, quiet=True))
+    assert float(estimate.parameters["youngs_modulus"]) == pytest.approx(7e3)
+    assert "no coarse search" in (tmp_path / "log.txt").read_text()
+
+
 def test_frames_span_the_duration(clip):
     stage = learner(START, ("youngs_modulus",), frames=4)
     assert stage.spread(clip.takes[0].footage).tolist() == [0, 3, 6, 9]
@@ -125,7 +132,6 @@ def test_what_does_not_fit_the_take_is_refused(clip, change, word):
 @pytest.mark.parametrize(
     "change, word",
     [({"learn": ("stiffness",)}, "learn.learn names 'stiffness'; take some of youngs_modulus"),
-     ({"learn": ("poissons_ratio",), "search": 3}, "no modulus"),
      ({"learn": ("poissons_ratio",), "ties": (("poissons_ratio", "youngs_modulus"),)}, "no scale to share")],
 )  # fmt: skip
 def test_what_does_not_fit_the_material_is_refused_when_it_is_said(change, word):
