@@ -129,7 +129,7 @@ class Viscoelastic(AbstractMaterial):
         psi = torch.zeros_like(H[:, 0, 0])
         if self.elastic:
             mu, lam = coefficients[:2]
-            psi = psi + mu * polar.stretch_distance(H) + lam / 2 * memory[0] ** 2
+            psi = psi + mu * polar.stretch_distance(H) + lam / 2 * volume.change(H) ** 2
         for i in range(self.branches):
             mu, K = coefficients[self._first(i) : self._first(i) + 2]
             k_d, k_v = coefficients[self._first(i) + 2 : self._first(i) + 4]
