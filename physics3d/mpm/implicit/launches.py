@@ -197,7 +197,7 @@ class StepLaunches:
             "push_back": self._back("push", w, **explicit["push"]),
         }  # fmt: skip
 
-    def _back(self, kernel: str, w: int, changed: Arguments | None = None, **adjoints: wp.array) -> Call | None:
+    def _back(self, kernel: str, w: int, changed: Arguments | None = None, **adjoints: wp.array | None) -> Call | None:
         """The generated adjoint of a kernel of the substep, with adjoint arrays for some of its arguments."""
         if kernel not in self.substeps.kernels:
             return None
