@@ -56,9 +56,7 @@ class Motion:
                 self.log.warn(f"{what}; take world.solver='grid' or 'auto'")
                 return motion
             self.log.warn(f"{what}: the grid takes over")
-        return grid.rollout(
-            self.world, parameters, self.position, self.volume, excitation=self.excitation, **timing
-        )
+        return grid.rollout(self.world, parameters, self.position, self.volume, excitation=self.excitation, **timing)
 
 
 def motion_of(

@@ -27,9 +27,7 @@ class Pins:
     def renumbered(self, keep: np.ndarray) -> "Pins":
         """Those on the pieces of a mask, numbered among these."""
         mine = keep[self.piece]
-        return Pins(
-            position=self.position[mine], area=self.area[mine], piece=(np.cumsum(keep) - 1)[self.piece[mine]]
-        )
+        return Pins(position=self.position[mine], area=self.area[mine], piece=(np.cumsum(keep) - 1)[self.piece[mine]])
 
 
 def outside_box(matter: Matter, lower: tuple, upper: tuple) -> tuple[Matter, Pins, np.ndarray]:
@@ -69,9 +67,9 @@ def outside_box(matter: Matter, lower: tuple, upper: tuple) -> tuple[Matter, Pin
             pin[rows, k, others[:, j]] += signs[j] * np.sqrt(np.maximum(S[chosen, others[:, j], others[:, j]], 0))
     area = V[chosen] / np.maximum(reach, 1e-30) / 4
     number = np.cumsum(keep) - 1
-    cut = replace(
-        matter, position=torch.from_numpy(x), moment=torch.from_numpy(S), volume=torch.from_numpy(V)
-    ).select(keep)
+    cut = replace(matter, position=torch.from_numpy(x), moment=torch.from_numpy(S), volume=torch.from_numpy(V)).select(
+        keep
+    )
     pins = Pins(position=pin.reshape(-1, 3), area=np.repeat(area, 4), piece=np.repeat(number[chosen], 4))
     return cut, pins, keep
 

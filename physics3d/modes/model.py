@@ -88,9 +88,7 @@ class Model:
         """Frequencies and loss factors of the modes of vibration, their shapes those of the stuck dash-pots."""
         strain = np.stack([(self.gradient @ shape).reshape(-1, 3, 3) for shape in self.shapes])
         kappa = vibration.relaxation(self.world.material, coefficients, self.weight, strain)
-        held = np.array(
-            [sum(np.vdot(s, k.matrix @ s) for k in self.springs if k.pull is None) for s in self.shapes]
-        )
+        held = np.array([sum(np.vdot(s, k.matrix @ s) for k in self.springs if k.pull is None) for s in self.shapes])
         return vibration.damped(lambda t: kappa(t) + held)
 
 
@@ -196,7 +194,9 @@ def model(
     if group.max() + 1 > MOST_GROUPS:  # a field of parameters: every particle counts
         which, factor = np.arange(len(weight)), np.ones(len(weight))
     else:
-        which, factor = cubature.chosen(slopes_there, tangent, K + np.kron(C.T @ (rest @ C), np.eye(3)), group, points_)
+        whole = K + np.kron(C.T @ (rest @ C), np.eye(3))
+        _, own_modes = vibration.dense_modes(whole, np.kron(C.T @ (scalar_mass @ C), np.eye(3)), modes, shift=shift)
+        which, factor = cubature.chosen(slopes_there, tangent, whole, own_modes, group, points_)
     slopes_there = np.ascontiguousarray(slopes_there.reshape(len(weight), 3, -1)[which].reshape(3 * len(which), -1))
     K = vibration.stiffness(slopes_there, tangent[:, which] * factor[:, None, None])
     K += np.kron(C.T @ (permanent @ C), np.eye(3))

@@ -7,7 +7,7 @@ long dt that of the springs that never relax. In between, kappa(t) = phi^T K(t) 
 relaxation of the mode, and its complex stiffness and loss factor are
 
     kappa*(omega) = kappa(inf) + i omega int_0^inf (kappa(t) - kappa(inf)) e^(-i omega t) dt,    omega^2 = Re kappa*,
-    eta = Im kappa* / Re kappa*                                                (an oscillation decays as e^(-eta omega t/2))
+    eta = Im kappa* / Re kappa*                              (an oscillation decays as e^(-eta omega t/2))
 """
 
 from collections.abc import Callable
@@ -91,9 +91,7 @@ def modes(
     factor = Factor((K + shift * M).tocsr())
     start = np.cos(np.arange(K.shape[0]) * 1.0)  # any vector, the same at each call
     operator = LinearOperator(K.shape, matvec=factor, dtype=float)
-    values, vectors = eigsh(
-        K, k=count, M=M, sigma=-shift, OPinv=operator, v0=start, tol=1e-8
-    )
+    values, vectors = eigsh(K, k=count, M=M, sigma=-shift, OPinv=operator, v0=start, tol=1e-8)
     order = np.argsort(values)
     return values[order], vectors[:, order]
 
@@ -105,7 +103,9 @@ def dense_modes(
     # the mass of some directions is next to nothing, so it is not the one that is factored
     count = min(count, len(K))
     K = (K + K.T) / 2 + shift * M
-    inverse, vectors = linalg.eigh(M, K + 1e-10 * np.diag(K).mean() * np.eye(len(K)), subset_by_index=(len(K) - count, len(K) - 1))
+    inverse, vectors = linalg.eigh(
+        M, K + 1e-10 * np.diag(K).mean() * np.eye(len(K)), subset_by_index=(len(K) - count, len(K) - 1)
+    )
     inverse, vectors = inverse[::-1], vectors[:, ::-1]
     return 1 / inverse - shift, vectors / np.sqrt(inverse)
 

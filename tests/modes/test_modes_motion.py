@@ -67,7 +67,11 @@ def test_a_free_body_flies_and_turns_rigidly():
     """Objectivity: a body thrown with a spin keeps its shape but for the centrifugal stretch, momentum exactly."""
     position, volume = row(6, 0.01)
     free = world(1e6, 0.3, boundaries=(), gravity=(0.0, 0.0, -9.81), dt=1e-3)
-    middle, spin, throw = position.mean(0), torch.tensor([0.0, 3.0, 2.0]).double(), torch.tensor([0.1, 0.0, 1.0]).double()
+    middle, spin, throw = (
+        position.mean(0),
+        torch.tensor([0.0, 3.0, 2.0]).double(),
+        torch.tensor([0.1, 0.0, 1.0]).double(),
+    )
     velocity = throw + torch.linalg.cross(spin.expand_as(position), position - middle)
     with torch.no_grad():
         motion = rollout(
@@ -108,9 +112,7 @@ def test_the_viscoelastic_bar_follows_its_modal_solution():
     shape = torch.sin(math.pi / 2 * position[:, 0])
     velocity = torch.zeros_like(position)
     velocity[:, 0] = speed * shape
-    bar = world(
-        1e4, 0.0, material=Viscoelastic(), start=start, density=DENSITY, boundaries=(CLAMP,), dt=0.01
-    )
+    bar = world(1e4, 0.0, material=Viscoelastic(), start=start, density=DENSITY, boundaries=(CLAMP,), dt=0.01)
     parameters = {name: torch.tensor(value).double() for name, value in start.items()}
     with torch.no_grad():
         motion = rollout(bar, parameters, position, volume, velocity=velocity, frames=41, frame_dt=0.05, log=Log(None))
