@@ -3,10 +3,10 @@
     make bench-swaying [ARGS="rows=beam,plant"]   ->   docs/results/swaying.csv, .md, .png
 
 Beams: Timoshenko (transfer matrix), clamped along an axis and free where turned. Plate and L-shape: quadratic hexahedra
-on a mesh that fits; the plant of the carnation twin: quadratic tetrahedra. Both by scikit-fem, the tetrahedra by fTetWild
-(`pip install scikit-fem pytetwild pyvista`); without them these rows have no truth and are left out.
-Bodies are filled as the pipeline fills them: a lattice of `spacing` through a closed surface. Times are processor time of
-one thread, for the machine is shared.
+on a mesh that fits; the plant of the carnation twin: quadratic tetrahedra. Both by scikit-fem, the tetrahedra by
+fTetWild (`pip install scikit-fem pytetwild pyvista`); without them these rows have no truth and are left out.
+Bodies are filled as the pipeline fills them: a lattice of `spacing` through a closed surface. Times are processor time
+of one thread, for the machine is shared.
 """
 
 import csv
@@ -145,7 +145,9 @@ BODIES = {
     "beam": beams,
     "turned": turned,
     "plate": lambda: boxes("clamped plate 120 x 60 x 6 mm", (0.12, 0.06, 0.006), None, (20, 10, 1)),
-    "L": lambda: boxes("L-shape, arms of 96 mm, 12 mm square", (0.096, 0.012, 0.096), (0.012, -1.0, 0.012), (16, 2, 16)),
+    "L": lambda: boxes(
+        "L-shape, arms of 96 mm, 12 mm square", (0.096, 0.012, 0.096), (0.012, -1.0, 0.012), (16, 2, 16)
+    ),
     "plant": plants,
 }
 

@@ -3,17 +3,19 @@
     x = (q_n + q_n+1)/2,   w = (v_n + v_n+1)/2 = (x - q_n) 2/dt,   v_n+1 - v_n = dt a(x)
     R(x) = M (2/dt (w - v_n) + c w) + f(x) + K_s (x - target) - load = 0,      f = sum_q w P(grad s x) : grad s
 
-Of second order; without damping of its own: energies that are quadratic, momentum and angular momentum are kept exactly,
-others without drift, for it is symplectic. What swings faster than a few steps is followed too slowly, not damped. Stresses
-are asked for at midpoints only, each a step after the last, so that branches with a memory stay of second order as well.
+Of second order; without damping of its own: energies that are quadratic, momentum and angular momentum are kept
+exactly, others without drift, for it is symplectic. What swings faster than a few steps is followed too slowly, not
+damped. Stresses are asked for at midpoints only, each a step after the last, so that branches with a memory stay of
+second order as well.
 
-Newton takes the matrix of an earlier state as long as the error falls fourfold per iteration, then that of the present one;
-a step that does not lessen the error is halved, and if that is of no use the step is refused (`NotSolved`).
+Newton takes the matrix of an earlier state as long as the error falls fourfold per iteration, then that of the present
+one; a step that does not lessen the error is halved, and if that is of no use the step is refused (`NotSolved`).
 
 The adjoint of a step solves A^T lam = x_bar by a Krylov method (GCR) with the matrix that Newton had as its
 preconditioner; the products with A^T are adjoints of the constitutive function, so it is that of the very same steps.
 """
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -120,9 +122,10 @@ class System:
         done, share = 0.0, 1.0
         while done < 1:
             share = min(share, 1 - done)
+            part = (done + share) * load
             try:
                 x = self._solve(
-                    x, lambda y: self.force(y, time) + self._held(y, 0.0)[0] - (done + share) * load, 0.0, time, 0.0
+                    x, lambda y, part=part: self.force(y, time) + self._held(y, 0.0)[0] - part, 0.0, time, 0.0
                 )
                 done += share
                 share *= 2
@@ -212,7 +215,7 @@ class System:
             return r, np.inf
         step = self._matrix.solve(r)
         error = float(np.sqrt(abs(np.vdot(step, r))))
-        for s, after in zip(steps, steps[1:]):
+        for s, after in itertools.pairwise(steps):
             step = step + after * (np.vdot(s, step) / np.vdot(s, s))
         if steps:
             step = step / (1 + np.vdot(steps[-1], step) / np.vdot(steps[-1], steps[-1]))

@@ -194,7 +194,9 @@ def model(
     if group.max() + 1 > MOST_GROUPS:  # a field of parameters: every particle counts
         which, factor = np.arange(len(weight)), np.ones(len(weight))
     else:
-        which, factor = cubature.chosen(slopes_there, tangent, K + np.kron(C.T @ (rest @ C), np.eye(3)), group, points_)
+        whole = K + np.kron(C.T @ (rest @ C), np.eye(3))
+        _, own_modes = vibration.dense_modes(whole, np.kron(C.T @ (scalar_mass @ C), np.eye(3)), modes, shift=shift)
+        which, factor = cubature.chosen(slopes_there, tangent, whole, own_modes, group, points_)
     slopes_there = np.ascontiguousarray(slopes_there.reshape(len(weight), 3, -1)[which].reshape(3 * len(which), -1))
     K = vibration.stiffness(slopes_there, tangent[:, which] * factor[:, None, None])
     K += np.kron(C.T @ (permanent @ C), np.eye(3))
