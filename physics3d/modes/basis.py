@@ -19,8 +19,8 @@ DEPENDENT = 1e-4  # of the largest
 
 
 def turned(
-    vectors: Float[np.ndarray, "3f m"], gradient: sparse.csr_matrix, weight: Float[np.ndarray, " q"]
-) -> Float[np.ndarray, "f 3m"]:
+    vectors: Float[np.ndarray, "n m"], gradient: sparse.csr_matrix, weight: Float[np.ndarray, " q"]
+) -> Float[np.ndarray, "f k"]:
     """Components of fields (row 3 j + i: component i of function j), each field scaled to a unit gradient."""
     fields = vectors.reshape(-1, 3, vectors.shape[1])
     slopes = gradient @ fields.reshape(len(fields), -1)

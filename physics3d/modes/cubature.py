@@ -21,10 +21,10 @@ WEIGHT = 10.0  # of the modes of vibration among the products
 
 
 def chosen(
-    gradient: Float[np.ndarray, "3n r"],
+    gradient: Float[np.ndarray, "rows r"],
     tangent: Float[np.ndarray, "9 n 3 3"],
-    K: Float[np.ndarray, "3r 3r"],
-    modes: Float[np.ndarray, "3r m"],
+    K: Float[np.ndarray, "u u"],
+    modes: Float[np.ndarray, "u m"],
     group: Int[np.ndarray, " n"],
     count: int,
     seed: int = 0,

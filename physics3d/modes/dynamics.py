@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
-from scipy import linalg
+from scipy import linalg, sparse
 
 from physics3d.modes.stress import Points
 from physics3d.modes.vibration import stiffness
@@ -41,7 +41,7 @@ class NotSolved(Exception):
 class Spring:
     """Holds part of the body at a target while it is on; `matrix` [r, r] N/m, of each component."""
 
-    matrix: Float[np.ndarray, "r r"]
+    matrix: np.ndarray | sparse.csr_matrix  # [r, r] [N/m]
     pull: Callable[[float], Float[np.ndarray, "r 3"]] | None = None  # matrix times the target at a time [N]; None: rest
     until: float = np.inf  # [s]
 
@@ -80,7 +80,7 @@ class _Matrix:
 class System:
     """A body in a basis of r functions."""
 
-    gradient: Float[np.ndarray, "3n r"]  # of the functions at the points [1/m]
+    gradient: Float[np.ndarray, "rows r"]  # of the functions at the points [1/m]
     mass: Float[np.ndarray, "r r"]  # [kg]
     points: Points
     springs: tuple[Spring, ...] = ()
