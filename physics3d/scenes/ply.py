@@ -21,7 +21,7 @@ from physics3d.scenes.axes import Axes
 from physics3d.scenes.base import AbstractSource, Capture
 from physics3d.scenes.photographs import triple
 from physics3d.scenes.studio import ring
-from physics3d.video import to_uint8
+from physics3d.pictures import to_uint8
 
 
 @dataclass(frozen=True, kw_only=True)
