@@ -17,11 +17,11 @@ from physics3d.gaussians.model import Gaussians
 from physics3d.gaussians.ply import read_ply
 from physics3d.gaussians.render import render
 from physics3d.gaussians.sh import sh_basis
+from physics3d.pictures import to_uint8
 from physics3d.scenes.axes import Axes
 from physics3d.scenes.base import AbstractSource, Capture
 from physics3d.scenes.photographs import triple
 from physics3d.scenes.studio import ring
-from physics3d.pictures import to_uint8
 
 
 @dataclass(frozen=True, kw_only=True)
