@@ -3,23 +3,25 @@
     x = (q_n + q_n+1)/2,   w = (v_n + v_n+1)/2 = (x - q_n) 2/dt,   v_n+1 - v_n = dt a(x)
     R(x) = M (2/dt (w - v_n) + c w) + f(x) + K_s (x - target) - load = 0,      f = sum_q w P(grad s x) : grad s
 
-Of second order; without damping of its own: energies that are quadratic, momentum and angular momentum are kept exactly,
-others without drift, for it is symplectic. What swings faster than a few steps is followed too slowly, not damped. Stresses
-are asked for at midpoints only, each a step after the last, so that branches with a memory stay of second order as well.
+Of second order; without damping of its own: energies that are quadratic, momentum and angular momentum are kept
+exactly, others without drift, for it is symplectic. What swings faster than a few steps is followed too slowly, not
+damped. Stresses are asked for at midpoints only, each a step after the last, so that branches with a memory stay of
+second order as well.
 
-Newton takes the matrix of an earlier state as long as the error falls fourfold per iteration, then that of the present one;
-a step that does not lessen the error is halved, and if that is of no use the step is refused (`NotSolved`).
+Newton takes the matrix of an earlier state as long as the error falls fourfold per iteration, then that of the present
+one; a step that does not lessen the error is halved, and if that is of no use the step is refused (`NotSolved`).
 
 The adjoint of a step solves A^T lam = x_bar by a Krylov method (GCR) with the matrix that Newton had as its
 preconditioner; the products with A^T are adjoints of the constitutive function, so it is that of the very same steps.
 """
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
-from scipy import linalg
+from scipy import linalg, sparse
 
 from physics3d.modes.stress import Points
 from physics3d.modes.vibration import stiffness
@@ -39,7 +41,7 @@ class NotSolved(Exception):
 class Spring:
     """Holds part of the body at a target while it is on; `matrix` [r, r] N/m, of each component."""
 
-    matrix: Float[np.ndarray, "r r"]
+    matrix: np.ndarray | sparse.csr_matrix  # [r, r] [N/m]
     pull: Callable[[float], Float[np.ndarray, "r 3"]] | None = None  # matrix times the target at a time [N]; None: rest
     until: float = np.inf  # [s]
 
@@ -78,7 +80,7 @@ class _Matrix:
 class System:
     """A body in a basis of r functions."""
 
-    gradient: Float[np.ndarray, "3n r"]  # of the functions at the points [1/m]
+    gradient: Float[np.ndarray, "rows r"]  # of the functions at the points [1/m]
     mass: Float[np.ndarray, "r r"]  # [kg]
     points: Points
     springs: tuple[Spring, ...] = ()
@@ -120,9 +122,10 @@ class System:
         done, share = 0.0, 1.0
         while done < 1:
             share = min(share, 1 - done)
+            part = (done + share) * load
             try:
                 x = self._solve(
-                    x, lambda y: self.force(y, time) + self._held(y, 0.0)[0] - (done + share) * load, 0.0, time, 0.0
+                    x, lambda y, part=part: self.force(y, time) + self._held(y, 0.0)[0] - part, 0.0, time, 0.0
                 )
                 done += share
                 share *= 2
@@ -212,7 +215,7 @@ class System:
             return r, np.inf
         step = self._matrix.solve(r)
         error = float(np.sqrt(abs(np.vdot(step, r))))
-        for s, after in zip(steps, steps[1:]):
+        for s, after in itertools.pairwise(steps):
             step = step + after * (np.vdot(s, step) / np.vdot(s, s))
         if steps:
             step = step / (1 + np.vdot(steps[-1], step) / np.vdot(steps[-1], steps[-1]))

@@ -126,8 +126,8 @@ class Lens:
 
 
 def undistorted(
-    planes: list[Float32[np.ndarray, "h w *c"]], lens: Lens, name: str
-) -> tuple[list[Float32[np.ndarray, "h w *c"]], Lens]:
+    planes: list[Float32[np.ndarray, "h w ..."]], lens: Lens, name: str
+) -> tuple[list[Float32[np.ndarray, "h w ..."]], Lens]:
     """Pictures (colour, matte) taken by `lens`, in 0..255 -> the same by its pinhole, and that pinhole."""
     import cv2
 

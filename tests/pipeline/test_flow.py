@@ -19,7 +19,8 @@ from pipeline.tracking import EXPERIMENT, address, flatten
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 RUN = """
-import json, sys, time
+import json, signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # whoever runs the tests in the background ignores it
 from pipeline import __main__ as command
 config = json.loads(sys.argv[1])
 command.compose = lambda words: (config, dict.fromkeys(command.GROUPS, "toy"))

@@ -111,7 +111,7 @@ def test_weights_that_are_nowhere_are_said_before_anything_is_computed(tmp_path,
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
     masker = {"_target_": "physics3d.segmentation.maskers.sam2.Sam2", "weights": "nobody/no-such-model"}
     stage = {"_target_": "stages.segment.Segment", "prompts": [], "masker": masker}
-    with pytest.raises(StageError, match=r"^segment: segment\.masker\.weights=nobody/no-such-model is neither"):
+    with pytest.raises(StageError, match=r"^segment: masker\.weights=nobody/no-such-model is neither"):
         Step.of("segment", "segment", stage, (), tmp_path)
     weights = tmp_path / "sam2.pt"
     weights.write_bytes(b"abc")

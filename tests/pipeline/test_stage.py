@@ -19,7 +19,8 @@ from pipeline.stage import StageError, Step, build, damage, load, run, usual_sec
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent.parent
 SCRIPT = """
-import sys
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # whoever runs the tests in the background ignores it
 from pathlib import Path
 from pipeline.stage import StageError
 from test_stage import chain

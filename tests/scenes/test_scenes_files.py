@@ -5,13 +5,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scene_formats as formats
 import torch
 from PIL import Image
 from test_scenes_loaders import Z_UP, write
+from test_scenes_strangers import transforms, write_llff
 
 from physics3d.gaussians.model import Gaussians
 from physics3d.gaussians.ply import write_ply
 from physics3d.log import Log
+from physics3d.scenes.llff import LlffSource
 from physics3d.scenes.ply import PlyScene
 from physics3d.scenes.unposed import UnposedSource
 
@@ -45,6 +48,17 @@ def source(kind: str, folder: Path):
         for i in range(2):  # too few for structure from motion: they are read, then refused
             Image.fromarray(np.full((80, 80, 3), 90 + i, np.uint8)).save(folder / f"{i}.png")
         return UnposedSource(name="x", path=str(folder), camera_distance=1.0)
+    if kind == "llff":
+        write_llff(folder, Z_UP)
+        return LlffSource(name="x", path=str(folder), up=(0, 0, 1), scale=1.0)
+    if kind == "masks and points":
+        (folder / "masks").mkdir()
+        made = transforms(folder, frame=lambda i, e: e.update(mask_path=f"masks/{i}.png"), ply_file_path="points.ply")
+        for i in range(len(list((folder / "images").iterdir()))):
+            Image.new("L", (formats.WIDTH, formats.HEIGHT), 255).save(folder / "masks" / f"{i}.png")
+        source("ply", folder)
+        (folder / "model.ply").rename(folder / "points.ply")
+        return made
     made = write(kind, folder, Z_UP)
     if kind == "pinhole":  # pictures that lie elsewhere
         (folder / "cameras").mkdir()
@@ -57,7 +71,11 @@ def source(kind: str, folder: Path):
 
 
 @pytest.mark.parametrize(
-    "kind", ["blender", "pinhole", "colmap_text", "colmap_binary", "pac_nerf", "ply", "photographs"]
+    "kind",
+    [
+        *("blender", "pinhole", "masks and points", "colmap_text", "colmap_binary", "llff", "pac_nerf", "ply"),
+        "photographs",
+    ],
 )
 def test_what_is_read_is_listed(kind, tmp_path):
     global opened
