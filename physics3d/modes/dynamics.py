@@ -8,7 +8,7 @@ exactly, others without drift, for it is symplectic. What swings faster than a f
 damped. Stresses are asked for at midpoints only, each a step after the last, so that branches with a memory stay of
 second order as well.
 
-Newton takes the matrix of an earlier state as long as the error falls fourfold per iteration, then that of the present
+Newton takes the matrix of an earlier state as long as the error halves in every iteration, then that of the present
 one; a step that does not lessen the error is halved, and if that is of no use the step is refused (`NotSolved`).
 
 The adjoint of a step solves A^T lam = x_bar by a Krylov method (GCR) with the matrix that Newton had as its
@@ -20,16 +20,18 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from scipy import linalg, sparse
 
 from physics3d.modes.stress import Points
 from physics3d.modes.vibration import stiffness
 
-TOLERANCE = 1e-11  # of the last correction, of the largest first one of the run; the norm is that of the matrix
+# of the last correction, of the largest first one of the run, in the norm of the matrix; by the precision asked for
+TOLERANCE = {torch.float32: 1e-6, torch.float64: 1e-11}
 ROUND_OFF = 1e-7  # the same, where no step is better
 MOST_ITERATIONS = 60
-SLOW = 0.25  # an error that falls by less asks for a new matrix
+SLOW = 0.5  # an error that falls by less asks for a new matrix
 SHORTEST = 1e-3  # share of a Newton step
 
 
@@ -85,6 +87,7 @@ class System:
     points: Points
     springs: tuple[Spring, ...] = ()
     drag: float = 0.0  # c [1/s]
+    tolerance: float = TOLERANCE[torch.float64]
     since: float = 0.0  # from the last midpoint to the start of the coming step [s]
     iterations: int = 0  # of Newton so far
     matrices: int = 0  # factored so far
@@ -179,7 +182,7 @@ class System:
         steps: list[np.ndarray] = []  # taken with the present matrix
         for _ in range(MOST_ITERATIONS):
             self.iterations += 1
-            if error <= TOLERANCE * self.scale:
+            if error <= self.tolerance * self.scale:
                 return x
             share = 1.0
             while True:
@@ -281,7 +284,7 @@ class System:
         directions: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         for _ in range(MOST_ITERATIONS):
             p = step.matrix.solve(r, True)
-            if np.linalg.norm(p) <= 1e-11 * size:
+            if np.linalg.norm(p) <= self.tolerance * size:
                 return lam
             Ap = product(p)
             # orthogonal in the norm of the preconditioned residual

@@ -21,7 +21,7 @@ from physics3d.materials.base import Values
 from physics3d.matter import Matter, in_one_piece, of_particles, points
 from physics3d.modes import basis, cubature, lattice, vibration
 from physics3d.modes.conditions import Conditions, Refused, conditions
-from physics3d.modes.dynamics import Spring, System
+from physics3d.modes.dynamics import TOLERANCE, Spring, System
 from physics3d.modes.stress import Points
 from physics3d.world import World
 
@@ -74,6 +74,7 @@ class Model:
             points=Points(self.world.material, coefficients, self.weight),
             springs=self.springs,
             drag=self.world.damping,
+            tolerance=TOLERANCE[self.world.dtype],
         )
 
     def at_points(self, coefficients: Tensor) -> Tensor:
