@@ -11,6 +11,7 @@ from physics3d.gaussians.model import Gaussians
 from physics3d.learning.chain import chain_of
 from physics3d.learning.fields import GlobalField
 from physics3d.learning.loss import Chain
+from physics3d.log import Log
 from physics3d.materials.viscoelastic import Viscoelastic
 from physics3d.priors.exemplar import Exemplar
 from physics3d.scenes.base import Capture, Take
@@ -82,9 +83,8 @@ def bar_chain(world: World, field: GlobalField, clip: Capture, frames: int) -> C
     """The bar in this world, compared with the first frames of the take."""
     gaussians, body = bar()
     every = torch.arange(frames)
-    return chain_of(
-        world, Exemplar(), field, clip, gaussians, body, clip.takes[0], every, image_scale=1.0, device="cpu"
-    )
+    how = dict(image_scale=1.0, device="cpu", log=Log(None))
+    return chain_of(world, Exemplar(), field, clip, gaussians, body, clip.takes[0], every, **how)
 
 
 def capture(truth: dict[str, float], *, frames: int = 10, fps: float = 20.0, views: int = 1, held_out=()) -> Capture:

@@ -21,7 +21,9 @@ def shares(gaussians: Gaussians, belief: Float[Tensor, "n k"], camera: Camera) -
     covariance, drawn = gaussians.covariance(), []
     for three in torch.nn.functional.pad(belief, (0, -belief.shape[1] % 3)).to(gaussians.mean).split(3, 1):
         with torch.no_grad():
-            picture = rasterize(gaussians.mean, covariance, gaussians.opacity, three, camera, background=(0, 0, 0))
+            picture = rasterize(
+                gaussians.mean, covariance, gaussians.opacity, three, camera, background=(0.0, 0.0, 0.0)
+            )
         drawn.append(picture.color.permute(2, 0, 1).cpu())
     return torch.cat(drawn)[: belief.shape[1]].numpy()
 
