@@ -11,6 +11,7 @@ from physics3d.gaussians.model import Gaussians
 from physics3d.learning.chain import chain_of
 from physics3d.learning.fields import GlobalField
 from physics3d.learning.loss import Chain
+from physics3d.log import Log
 from physics3d.materials.viscoelastic import Viscoelastic
 from physics3d.priors.exemplar import Exemplar
 from physics3d.scenes.base import Capture, Take
@@ -83,7 +84,17 @@ def bar_chain(world: World, field: GlobalField, clip: Capture, frames: int) -> C
     gaussians, body = bar()
     every = torch.arange(frames)
     return chain_of(
-        world, Exemplar(), field, clip, gaussians, body, clip.takes[0], every, image_scale=1.0, device="cpu"
+        world,
+        Exemplar(),
+        field,
+        clip,
+        gaussians,
+        body,
+        clip.takes[0],
+        every,
+        image_scale=1.0,
+        device="cpu",
+        log=Log(None),
     )
 
 

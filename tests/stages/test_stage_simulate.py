@@ -67,7 +67,7 @@ def test_initial_velocity_of_the_estimate_is_used(body):
     torch.testing.assert_close(x[-1], expected, atol=1e-6, rtol=0)
 
 
-@pytest.mark.parametrize("dx, word", [(0.3, r"smaller than a cell; take dx <= 0\.013 m"), (0.19, None)])
+@pytest.mark.parametrize("dx, word", [(0.3, r"smaller than a cell; take world.dx <= 0\.013 m"), (0.19, None)])
 def test_a_body_smaller_than_a_cell_is_refused(body, dx, word):
     """0.2 m wide: 4 particles, 0.05 m apart. A fifteenth of that is 0.0133 m."""
     run = lambda: Simulate(world=replace(WORLD, dx=dx), frames=2, fps=100.0)(body, WORLD.estimate(), log=Log(None))
