@@ -285,7 +285,7 @@ SETTINGS += [(f"material={n}",) for n in choices("material") if n != "parts"]
 SETTINGS += [(f"profile={n}",) for n in choices("profile")] + [(f"method={n}",) for n in choices("method")]
 
 
-@pytest.mark.xfail(
+@pytest.mark.xfail(strict=False, reason="some values of the newest materials are not refused in one line")
     strict=False, reason="a few values of the newest materials and of scale are not yet refused in one line"
 )
 @pytest.mark.parametrize("words", SETTINGS, ids=" ".join)
