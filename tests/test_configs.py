@@ -286,8 +286,6 @@ SETTINGS += [(f"profile={n}",) for n in choices("profile")] + [(f"method={n}",) 
 
 
 @pytest.mark.xfail(strict=False, reason="some values of the newest materials are not refused in one line")
-    strict=False, reason="a few values of the newest materials and of scale are not yet refused in one line"
-)
 @pytest.mark.parametrize("words", SETTINGS, ids=" ".join)
 def test_every_number_and_name_that_cannot_be_is_refused_in_one_line(words):
     """Every leaf of the page, every bad value; those of a scene, prior, ... only where these are not the usual ones."""
