@@ -92,7 +92,7 @@ def of_samples(
     moment += (h / n) ** 2 / 12 * np.eye(3)
     # neighbours share a face on which both have matter
     solid = inside.reshape(-1, n, n, n)
-    size = cell.max(0) + 2
+    size = cell.max(0, initial=0) + 2
     key = (cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2]
     order = np.argsort(key)
     links = []

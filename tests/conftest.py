@@ -7,15 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from jaxtyping import config, install_import_hook
+from shape_hook import with_checked_shapes
 
 ROOT = Path(__file__).resolve().parent.parent
-
-
-def with_checked_shapes() -> list[str]:
-    """The modules of library and stages that have no Warp kernels: those are another language."""
-    files = [path for folder in ("physics3d", "stages") for path in sorted((ROOT / folder).rglob("*.py"))]
-    plain = [path for path in files if path.name != "__init__.py" and "@wp." not in path.read_text()]
-    return [".".join(path.relative_to(ROOT).with_suffix("").parts) for path in plain]
 
 
 install_import_hook(with_checked_shapes(), "shapes.checked")  # before any of them is imported

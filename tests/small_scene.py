@@ -83,8 +83,19 @@ def bar_chain(world: World, field: GlobalField, clip: Capture, frames: int) -> C
     """The bar in this world, compared with the first frames of the take."""
     gaussians, body = bar()
     every = torch.arange(frames)
-    how = dict(image_scale=1.0, device="cpu", log=Log(None))
-    return chain_of(world, Exemplar(), field, clip, gaussians, body, clip.takes[0], every, **how)
+    return chain_of(
+        world,
+        Exemplar(),
+        field,
+        clip,
+        gaussians,
+        body,
+        clip.takes[0],
+        every,
+        image_scale=1.0,
+        device="cpu",
+        log=Log(None),
+    )
 
 
 def capture(truth: dict[str, float], *, frames: int = 10, fps: float = 20.0, views: int = 1, held_out=()) -> Capture:

@@ -4,8 +4,8 @@ import importlib
 
 import pytest
 import torch
-from conftest import with_checked_shapes
 from jaxtyping import TypeCheckError
+from shape_hook import with_checked_shapes
 
 from physics3d.mpm.velocity_gradient import velocity_gradient
 from physics3d.trajectory import Trajectory

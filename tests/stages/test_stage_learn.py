@@ -6,6 +6,7 @@ import pytest
 import torch
 from small_scene import ELASTIC, bar, capture, learner
 
+from physics3d.learning.chain import chain_of
 from physics3d.log import Log
 from physics3d.scenes.base import Footage
 from physics3d.world import Estimate
@@ -106,7 +107,8 @@ def test_frames_that_are_not_equally_far_apart_are_compared_with_the_same_instan
     field = stage.field(stage.world.estimate(), speed=1.0)
     found = {}
     for at in (stage.spread(clip.takes[0].footage), torch.arange(7)):
-        chain = stage.chain(clip, gaussians, body, clip.takes[0], field, at)
+        how = dict(image_scale=1.0, device="cpu", log=Log(None))
+        chain = chain_of(stage.world, stage.prior, field, clip, gaussians, body, clip.takes[0], at, **how)
         drawn = chain.render(chain.simulate(field.zero()), 0, torch.arange(7))
         found[tuple(at.tolist())] = drawn
         assert float((drawn - clip.takes[0].videos[0][at].float() / 255).abs().max()) <= 0.5 / 255 + 1e-3
