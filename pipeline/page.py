@@ -8,6 +8,7 @@ the key is the one to set: world.dx of a scene is scene.dx.
 import difflib
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -158,6 +159,12 @@ def _between(config: dict[str, Any]) -> Iterator[str]:
             f"segment.prompts names the parts {sorted(parts)}; take those that the material has, {sorted(materials)}, "
             "or another material"
         )
+    source, learn = config["capture"]["source"], config["learn"]
+    with suppress(Unknown):
+        known = declared(source["_target_"])
+        filmed = (known.defaults | source).get("frames") if {"frames", "fps"} <= set(known.hints) else None  # a twin
+        if learn and filmed and learn["frames"] > filmed:
+            yield f"learn.frames is {learn['frames']}; take at most the {filmed} of a take (scene.source.frames)"
     force, excitation = config["simulate"].get("force"), config["simulate"].get("excitation", ())
     if force and any(force.values()) and not any(push.get("force") for push in excitation):
         yield (
