@@ -156,7 +156,7 @@ def require_fields(of: Any, where: str) -> None:
     kind = type(of)
     values = {field.name: getattr(of, field.name) for field in fields(of)}
     for name, value in values.items():
-        _raise(complaint(_hints(kind)[name], value, f"{where}.{name}"))
+        _raise(complaint(_hints(kind)[name], value, f"{where}.{name}"))  # type: ignore[arg-type]
     for rule in getattr(kind, "RULES", ()):
         _raise(rule(values, where))
 

@@ -2,11 +2,11 @@
 
     V = int dX,   X_c = 1/V int X dX,   S = 1/V int (X - X_c) (X - X_c)^T dX        [m^3], [m], [m^2]
 
-A piece is what one lattice cell holds of the body, or a particle: a cube of its volume, unless something better is known.
-It is integrated at the eight points X_c + S^(1/2) (+-1, +-1, +-1), which have its volume, centroid and second moment,
-so that a part thinner than a cell bends as it should. (Its midpoint alone would lose 1/n^2 of the second moment of a
-section n pieces across.) Two pieces are linked where matter of one touches matter of the other: what lies across a gap
-is not.
+A piece is what one lattice cell holds of the body, or a particle: a cube of its volume, unless something better is
+known. It is integrated at the eight points X_c + S^(1/2) (+-1, +-1, +-1), which have its volume, centroid and second
+moment, so that a part thinner than a cell bends as it should. (Its midpoint alone would lose 1/n^2 of the second
+moment of a section n pieces across.) Two pieces are linked where matter of one touches matter of the other: what lies
+across a gap is not.
 """
 
 from dataclasses import dataclass, replace
@@ -81,7 +81,8 @@ def of_samples(
     owner: Int[np.ndarray, " m"],
 ) -> Matter:
     """Pieces of lattice cells of edge h [m], from samples: cell i begins at origin + h cell_i; `inside` [m, s] says
-    which of its samples, at `offset` in the unit cell, are matter. `offset` is a cubic arrangement of n^3, x slowest."""
+    which of its samples, at `offset` in the unit cell, are matter. `offset` is a cubic arrangement of n^3, x
+    slowest."""
     n = round(len(offset) ** (1 / 3))
     count = inside.sum(1)
     at = origin + h * (cell[:, None] + offset)
@@ -112,9 +113,9 @@ def of_samples(
 
 
 def in_one_piece(matter: Matter) -> Matter:
-    """With clusters that no link joins to the rest, but that are nearer than two edges of a piece, linked where they are
-    nearest: slivers that the sampling cut off, particles that lie loosely. (Filling calls what is farther a piece of
-    its own.)"""
+    """With clusters that no link joins to the rest, but that are nearer than two edges of a piece, linked where they
+    are nearest: slivers that the sampling cut off, particles that lie loosely. (Filling calls what is farther a piece
+    of its own.)"""
     x = matter.position.numpy()
     while True:
         links, m = matter.links.numpy(), len(matter.position)

@@ -6,8 +6,10 @@ Other types are left to mypy, and values to the code itself, whose own words the
 from collections.abc import Callable
 from typing import Any, get_args
 
-from beartype import beartype
+from beartype import BeartypeConf, beartype
 from jaxtyping import AbstractArray
+
+CONF = BeartypeConf(is_pep484_tower=True)  # a whole number will do where a real one is asked for
 
 
 def checked(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -16,7 +18,7 @@ def checked(function: Callable[..., Any]) -> Callable[..., Any]:
     if not shaped:
         return function
     function.__annotations__ = shaped
-    return beartype(function)
+    return beartype(conf=CONF)(function)
 
 
 def has_shape(hint: Any) -> bool:

@@ -1,12 +1,16 @@
 """The library is useful alone: its modules need none of what orchestrates, downloads, or is for single stages."""
 
+import ast
 import subprocess
 import sys
+import tomllib
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
+PACKAGES = ("physics3d", "stages", "pipeline")
 # what `pip install` of the library alone might not bring
 BLOCKED = (
     "prefect",
@@ -71,3 +75,21 @@ def test_no_library_takes_the_signal_that_ends_a_run():
     pytest.importorskip("pycolmap")
     done = subprocess.run([sys.executable, "-c", TERMINATE], cwd=ROOT, capture_output=True, text=True)
     assert done.stdout.endswith("interrupted\n") and not done.returncode, done.stderr
+
+
+def imported_at_the_top(path: Path) -> set[str]:
+    """Packages that importing the file imports, by the first part of their names."""
+    body = ast.parse(path.read_text()).body
+    names = [alias.name for node in body if isinstance(node, ast.Import) for alias in node.names]
+    names += [node.module or "" for node in body if isinstance(node, ast.ImportFrom)]
+    return {name.split(".")[0] for name in names}
+
+
+def test_importing_the_project_needs_no_more_than_its_dependencies():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    declared = {"".join(c if c.isalnum() or c in "-_." else " " for c in d).split()[0] for d in project["dependencies"]}
+    installs = packages_distributions()
+    files = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
+    used = set().union(*map(imported_at_the_top, files)) - set(PACKAGES)
+    missing = {name for name in used if name in installs and not declared & set(installs[name])}
+    assert not missing, f"imported, but no dependency in pyproject.toml: {sorted(missing)}"

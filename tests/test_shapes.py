@@ -1,10 +1,6 @@
-"""Shapes in annotations are held to while the tests run; the library imports nothing that only tests need."""
+"""Shapes in annotations are held to while the tests run."""
 
-import ast
 import importlib
-import tomllib
-from importlib.metadata import packages_distributions
-from pathlib import Path
 
 import pytest
 import torch
@@ -13,9 +9,6 @@ from jaxtyping import TypeCheckError
 
 from physics3d.mpm.velocity_gradient import velocity_gradient
 from physics3d.trajectory import Trajectory
-
-ROOT = Path(__file__).resolve().parent.parent
-PACKAGES = ("physics3d", "stages", "pipeline")
 
 
 def test_a_wrong_shape_is_refused():
@@ -43,21 +36,3 @@ def test_the_check_can_be_left_out(unchecked):
 def test_public_functions_are_checked(name: str):
     assert name in with_checked_shapes()
     assert any(type(x).__name__ == "_JaxtypingLoader" for x in [importlib.import_module(name).__spec__.loader])
-
-
-def imported_at_the_top(path: Path) -> set[str]:
-    """Packages that importing the file imports, by the first part of their names."""
-    body = ast.parse(path.read_text()).body
-    names = [alias.name for node in body if isinstance(node, ast.Import) for alias in node.names]
-    names += [node.module or "" for node in body if isinstance(node, ast.ImportFrom)]
-    return {name.split(".")[0] for name in names}
-
-
-def test_importing_the_project_needs_no_more_than_its_dependencies():
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    declared = {"".join(c if c.isalnum() or c in "-_." else " " for c in d).split()[0] for d in project["dependencies"]}
-    installs = packages_distributions()
-    files = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
-    used = set().union(*map(imported_at_the_top, files)) - set(PACKAGES)
-    missing = {name for name in used if name in installs and not declared & set(installs[name])}
-    assert not missing, f"imported, but no dependency in pyproject.toml: {sorted(missing)}"

@@ -38,7 +38,7 @@ from torch import Tensor
 
 from physics3d.boundaries import base
 from physics3d.boundaries.half_space import Kind, coulomb
-from physics3d.checks import Lasting, NotNegative, Positive, Time
+from physics3d.checks import Lasting, NotNegative, Positive
 from physics3d.open3d_import import open3d
 from physics3d.warp_types import matrix, vector, vector4
 
@@ -60,7 +60,7 @@ class MeshCollider(base.AbstractBoundary):
     position: base.Vector = (0.0, 0.0, 0.0)  # of the mesh's origin [m]
     velocity: base.Vector = (0.0, 0.0, 0.0)  # [m/s]
     angular_velocity: base.Vector = (0.0, 0.0, 0.0)  # about `position`, which travels along [rad/s]
-    start: Time = 0.0  # [s]
+    start: float = 0.0  # before the first frame: it is under way then [s]
     duration: Lasting = math.inf  # [s]
     kind: Kind = "sticky"
     friction: NotNegative = 0.0  # Coulomb coefficient, for slip and separate

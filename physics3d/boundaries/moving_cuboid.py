@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from physics3d.boundaries import base
-from physics3d.checks import Corners, Duration, Time
+from physics3d.checks import Corners, Duration
 from physics3d.warp_types import vector
 
 
@@ -23,7 +23,7 @@ class MovingCuboid(base.AbstractBoundary):
     lower: base.Vector
     upper: base.Vector
     velocity: base.Vector
-    start: Time = 0.0
+    start: float = 0.0  # before the first frame: it is under way then [s]
     duration: Duration
 
     RULES = (Corners("lower", "upper"),)

@@ -100,6 +100,7 @@ def fill(
         log.info(f"interior left out: a shell of {volume.sum():.4g} m^3 stays")
     if len(flat):
         side = surface.normal[bare][cKDTree(surface.point[bare]).query(flat)[1]]
+        assert thickness is not None  # there is flat matter, so it was given or measured above
         moment = disc_moment(side, area, thickness)
         matter = with_particles(matter, flat, area * thickness, moment, len(position))
         position, volume = np.concatenate([position, flat]), np.concatenate([volume, area * thickness])

@@ -24,7 +24,7 @@ def sheet(point: np.ndarray, normal: np.ndarray, spacing: float) -> tuple[np.nda
 
 
 def disc_moment(normal: np.ndarray, area: np.ndarray, thickness: float) -> np.ndarray:
-    """Second moments [s, 3, 3] m^2, per volume, of plates with these normals [s, 3], areas [s] m^2 and thickness [m]."""
+    """Second moments [s, 3, 3] m^2, per volume, of plates: normals [s, 3], areas [s] m^2, one thickness [m]."""
     across = normal[:, :, None] * normal[:, None, :]
     return thickness**2 / 12 * across + area[:, None, None] / 12 * (np.eye(3) - across)
 

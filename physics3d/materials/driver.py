@@ -16,8 +16,8 @@ from physics3d.materials.parameters import Values
 
 
 def prescribed(
-    material: AbstractMaterial, values: Values, time: Float[Tensor, " t"], deformation: Float[Tensor, "t *n 3 3"]
-) -> Float[Tensor, "t *n 3 3"]:
+    material: AbstractMaterial, values: Values, time: Float[Tensor, " t"], deformation: Float[Tensor, "rows *n 3 3"]
+) -> Float[Tensor, "rows *m 3 3"]:
     """Stress [Pa] along a path F(t) that starts at F = I, in the dtype of `deformation`. time [s] increases.
 
     Raises ValueError if the table does not start at rest, time does not increase, or a parameter is out of range.
@@ -27,7 +27,7 @@ def prescribed(
     # differences in float64: what float32 can hold of a small increment is in L, not in F
     F = (deformation[:, None] if one_sample else deformation).double()
     samples = _Samples(material, values, F.shape[1], deformation.dtype)
-    M = torch.linalg.solve(F[:-1], F[1:] - F[:-1], left=False).to(deformation.dtype)
+    M = torch.linalg.solve(F[:-1], F[1:] - F[:-1], left=False).to(deformation.dtype).expand(-1, samples.count, 3, 3)
     stress = [samples.stress()]
     for dt, M_step in zip(time.diff().tolist(), M, strict=True):
         stress.append(samples.step(dt, M_step))
@@ -35,8 +35,8 @@ def prescribed(
 
 
 def simple_shear(
-    material: AbstractMaterial, values: Values, time: Float[Tensor, " t"], shear: Float[Tensor, "t *n"]
-) -> Float[Tensor, "t *n 3 3"]:
+    material: AbstractMaterial, values: Values, time: Float[Tensor, " t"], shear: Float[Tensor, "rows *n"]
+) -> Float[Tensor, "rows *m 3 3"]:
     """Stress [Pa] under x = X + shear(t) Y. Errors as in `prescribed`."""
     F = torch.eye(3, dtype=shear.dtype).expand(*shear.shape, 3, 3).clone()
     F[..., 0, 1] = shear
@@ -44,8 +44,8 @@ def simple_shear(
 
 
 def uniaxial(
-    material: AbstractMaterial, values: Values, time: Float[Tensor, " t"], stretch: Float[Tensor, "t *n"]
-) -> tuple[Float[Tensor, "t *n"], Float[Tensor, "t *n"]]:
+    material: AbstractMaterial, values: Values, time: Float[Tensor, " t"], stretch: Float[Tensor, "rows *n"]
+) -> tuple[Float[Tensor, "rows *m"], Float[Tensor, "rows *m"]]:
     """Tension or compression with traction-free sides: (tau_11 [Pa], lateral stretch) in the dtype of `stretch`.
 
     Raises ValueError as `prescribed`, and RuntimeError when no lateral stretch frees the sides from traction.
@@ -123,7 +123,6 @@ class _Samples:
         )
 
     def _trial(self, dt: float, M: Tensor, H: Tensor, coefficients: Tensor, memory: Tensor) -> tuple[Tensor, ...]:
-        M = M.expand(self.count, 3, 3)
         return advance(self.material, dt, M / dt if dt > 0 else M, H, coefficients, memory)
 
 

@@ -56,10 +56,10 @@ class MooneyRivlin(AbstractMaterial):
         self, coefficients: Float[Tensor, "3 n"], H: Float[Tensor, "n 3 3"], memory: Float[Tensor, "1 n"]
     ) -> Float[Tensor, " n"]:
         first, second, K = coefficients
-        B = volume.isochoric_strain(H, 1 + memory[0])
+        B = volume.isochoric_strain(H)
         y = B.diagonal(dim1=1, dim2=2).sum(1)
         second_invariant = 2 * y + (y**2 - (B * B).sum((1, 2))) / 2  # less 3
-        return first * y + second * second_invariant + K * volume.volumetric_energy(memory[0])
+        return first * y + second * second_invariant + K * volume.volumetric_energy(H)
 
     def advance(self, real: type) -> wp.Function:
         return _advance(real)

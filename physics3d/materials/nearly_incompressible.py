@@ -65,9 +65,8 @@ class NearlyIncompressible(AbstractMaterial):
         self, coefficients: Float[Tensor, "2 n"], H: Float[Tensor, "n 3 3"], memory: Float[Tensor, "1 n"]
     ) -> Float[Tensor, " n"]:
         mu, K = coefficients
-        J = 1 + memory[0]
-        y = volume.isochoric_strain(H, J).diagonal(dim1=1, dim2=2).sum(1)
-        return mu / 2 * y + K * volume.volumetric_energy(memory[0])
+        y = volume.isochoric_strain(H).diagonal(dim1=1, dim2=2).sum(1)
+        return mu / 2 * y + K * volume.volumetric_energy(H)
 
     def advance(self, real: type) -> wp.Function:
         return _advance(real)

@@ -62,7 +62,7 @@ class NeoHookean(AbstractMaterial):
         mu, lam = coefficients
         F = H + torch.eye(3, dtype=H.dtype, device=H.device)
         # finite where round-off makes J <= 0, for which there is no energy
-        J = (1 + memory[0]).clamp(min=1e-30)
+        J = volume.determinant(F).clamp(min=1e-30)
         log_J, floor = torch.log(J), math.log(_FLOOR)
         # below the floor the integral of the tangent, so that the derivative is the stress there too
         below = floor**2 / 2 + (floor - 1) * (log_J - floor) + J / _FLOOR - 1

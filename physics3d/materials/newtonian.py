@@ -78,7 +78,7 @@ def _advance(real: type) -> wp.Function:
     carried_volume = volume.carried_volume(real)
     least2 = real(_LEAST_RATE**2)
 
-    cofactor, least_det = volume.cofactor(real), real(1e-12)
+    cofactor, least_det = volume.cofactor(real), real(1e-5 if real is wp.float32 else 1e-12)
 
     @wp.func(name=f"rate_of_deformation_{real.__name__}")
     def rate(dt: real, L: mat33, M: mat33):

@@ -59,7 +59,7 @@ class StableNeoHookean(AbstractMaterial):
         self, coefficients: Float[Tensor, "2 n"], H: Float[Tensor, "n 3 3"], memory: Float[Tensor, "1 n"]
     ) -> Float[Tensor, " n"]:
         mu, lam = coefficients
-        i, j = (2 * H + H @ H.mT).diagonal(dim1=1, dim2=2).sum(1), memory[0]
+        i, j = (2 * H + H @ H.mT).diagonal(dim1=1, dim2=2).sum(1), volume.change(H)
         return mu / 2 * (i - torch.log1p(i / 4)) + lam / 2 * j**2 - 3 / 4 * mu * j
 
     def advance(self, real: type) -> wp.Function:

@@ -129,7 +129,7 @@ class Viscoelastic(AbstractMaterial):
         psi = torch.zeros_like(H[:, 0, 0])
         if self.elastic:
             mu, lam = coefficients[:2]
-            psi = psi + mu * polar.stretch_distance(H) + lam / 2 * memory[0] ** 2
+            psi = psi + mu * polar.stretch_distance(H) + lam / 2 * volume.change(H) ** 2
         for i in range(self.branches):
             mu, K = coefficients[self._first(i) : self._first(i) + 2]
             k_d, k_v = coefficients[self._first(i) + 2 : self._first(i) + 4]
@@ -144,6 +144,14 @@ class Viscoelastic(AbstractMaterial):
 
     def advance(self, real: type) -> wp.Function:
         return _advance(self.branches, self.elastic, self.spring, self.flow, real)
+
+
+_NEAR = 1.0  # relaxation times: after a longer step the strain is stored as it is, after a shorter one ahead
+
+
+def _grown(x: Tensor) -> Tensor:
+    """1/g = (e^x - 1)/x (`tensors/decay.py`)."""
+    return torch.where(x > 0, torch.expm1(x) / x.clamp(min=1e-30), 1.0)
 
 
 @functools.cache

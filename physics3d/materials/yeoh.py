@@ -79,8 +79,8 @@ class Yeoh(AbstractMaterial):
         self, coefficients: Float[Tensor, "4 n"], H: Float[Tensor, "n 3 3"], memory: Float[Tensor, "2 n"]
     ) -> Float[Tensor, " n"]:
         first, second, third, K = coefficients
-        y = volume.isochoric_strain(H, 1 + memory[0]).diagonal(dim1=1, dim2=2).sum(1)
-        return first * y + second * y**2 + third * y**3 + K * volume.volumetric_energy(memory[0])
+        y = volume.isochoric_strain(H).diagonal(dim1=1, dim2=2).sum(1)
+        return first * y + second * y**2 + third * y**3 + K * volume.volumetric_energy(H)
 
     def advance(self, real: type) -> wp.Function:
         return _advance(real)

@@ -4,8 +4,8 @@
 
 Each component is a scalar field with a vector for an amplitude. A mode phi thus brings with it every A phi, A a 3 x 3
 matrix, so that a part of the body that a large motion has turned still has its modes, in its own new directions: von
-Tycowicz et al. (2013), "An efficient construction of reduced deformable objects". A free body has 1, X, Y, Z as well, and
-so is every rigid motion one of its motions, exactly.
+Tycowicz et al. (2013), "An efficient construction of reduced deformable objects". A free body has 1, X, Y, Z as well,
+and so is every rigid motion one of its motions, exactly.
 
 Fields that the others already hold are left out: singular values below DEPENDENT in the norm
 |s|^2 = int |grad s|^2 + s^2/l^2, l the size of the body.
@@ -19,8 +19,8 @@ DEPENDENT = 1e-4  # of the largest
 
 
 def turned(
-    vectors: Float[np.ndarray, "3f m"], gradient: sparse.csr_matrix, weight: Float[np.ndarray, " q"]
-) -> Float[np.ndarray, "f 3m"]:
+    vectors: Float[np.ndarray, "n m"], gradient: sparse.csr_matrix, weight: Float[np.ndarray, " q"]
+) -> Float[np.ndarray, "f k"]:
     """Components of fields (row 3 j + i: component i of function j), each field scaled to a unit gradient."""
     fields = vectors.reshape(-1, 3, vectors.shape[1])
     slopes = gradient @ fields.reshape(len(fields), -1)

@@ -3,31 +3,35 @@
     x = (q_n + q_n+1)/2,   w = (v_n + v_n+1)/2 = (x - q_n) 2/dt,   v_n+1 - v_n = dt a(x)
     R(x) = M (2/dt (w - v_n) + c w) + f(x) + K_s (x - target) - load = 0,      f = sum_q w P(grad s x) : grad s
 
-Of second order; without damping of its own: energies that are quadratic, momentum and angular momentum are kept exactly,
-others without drift, for it is symplectic. What swings faster than a few steps is followed too slowly, not damped. Stresses
-are asked for at midpoints only, each a step after the last, so that branches with a memory stay of second order as well.
+Of second order; without damping of its own: energies that are quadratic, momentum and angular momentum are kept
+exactly, others without drift, for it is symplectic. What swings faster than a few steps is followed too slowly, not
+damped. Stresses are asked for at midpoints only, each a step after the last, so that branches with a memory stay of
+second order as well.
 
-Newton takes the matrix of an earlier state as long as the error falls fourfold per iteration, then that of the present one;
-a step that does not lessen the error is halved, and if that is of no use the step is refused (`NotSolved`).
+Newton takes the matrix of an earlier state as long as the error halves in every iteration, then that of the present
+one; a step that does not lessen the error is halved, and if that is of no use the step is refused (`NotSolved`).
 
 The adjoint of a step solves A^T lam = x_bar by a Krylov method (GCR) with the matrix that Newton had as its
 preconditioner; the products with A^T are adjoints of the constitutive function, so it is that of the very same steps.
 """
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+import torch
 from jaxtyping import Float
-from scipy import linalg
+from scipy import linalg, sparse
 
 from physics3d.modes.stress import Points
 from physics3d.modes.vibration import stiffness
 
-TOLERANCE = 1e-11  # of the last correction, of the largest first one of the run; the norm is that of the matrix
+# of the last correction, of the largest first one of the run, in the norm of the matrix; by the precision asked for
+TOLERANCE = {torch.float32: 1e-6, torch.float64: 1e-11}
 ROUND_OFF = 1e-7  # the same, where no step is better
 MOST_ITERATIONS = 60
-SLOW = 0.25  # an error that falls by less asks for a new matrix
+SLOW = 0.5  # an error that falls by less asks for a new matrix
 SHORTEST = 1e-3  # share of a Newton step
 
 
@@ -39,7 +43,7 @@ class NotSolved(Exception):
 class Spring:
     """Holds part of the body at a target while it is on; `matrix` [r, r] N/m, of each component."""
 
-    matrix: Float[np.ndarray, "r r"]
+    matrix: np.ndarray | sparse.csr_matrix  # [r, r] [N/m]
     pull: Callable[[float], Float[np.ndarray, "r 3"]] | None = None  # matrix times the target at a time [N]; None: rest
     until: float = np.inf  # [s]
 
@@ -78,11 +82,12 @@ class _Matrix:
 class System:
     """A body in a basis of r functions."""
 
-    gradient: Float[np.ndarray, "3n r"]  # of the functions at the points [1/m]
+    gradient: Float[np.ndarray, "rows r"]  # of the functions at the points [1/m]
     mass: Float[np.ndarray, "r r"]  # [kg]
     points: Points
     springs: tuple[Spring, ...] = ()
     drag: float = 0.0  # c [1/s]
+    tolerance: float = TOLERANCE[torch.float64]
     since: float = 0.0  # from the last midpoint to the start of the coming step [s]
     iterations: int = 0  # of Newton so far
     matrices: int = 0  # factored so far
@@ -120,9 +125,10 @@ class System:
         done, share = 0.0, 1.0
         while done < 1:
             share = min(share, 1 - done)
+            part = (done + share) * load
             try:
                 x = self._solve(
-                    x, lambda y: self.force(y, time) + self._held(y, 0.0)[0] - (done + share) * load, 0.0, time, 0.0
+                    x, lambda y, part=part: self.force(y, time) + self._held(y, 0.0)[0] - part, 0.0, time, 0.0
                 )
                 done += share
                 share *= 2
@@ -176,7 +182,7 @@ class System:
         steps: list[np.ndarray] = []  # taken with the present matrix
         for _ in range(MOST_ITERATIONS):
             self.iterations += 1
-            if error <= TOLERANCE * self.scale:
+            if error <= self.tolerance * self.scale:
                 return x
             share = 1.0
             while True:
@@ -212,7 +218,7 @@ class System:
             return r, np.inf
         step = self._matrix.solve(r)
         error = float(np.sqrt(abs(np.vdot(step, r))))
-        for s, after in zip(steps, steps[1:]):
+        for s, after in itertools.pairwise(steps):
             step = step + after * (np.vdot(s, step) / np.vdot(s, s))
         if steps:
             step = step / (1 + np.vdot(steps[-1], step) / np.vdot(steps[-1], steps[-1]))
@@ -278,7 +284,7 @@ class System:
         directions: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         for _ in range(MOST_ITERATIONS):
             p = step.matrix.solve(r, True)
-            if np.linalg.norm(p) <= 1e-11 * size:
+            if np.linalg.norm(p) <= self.tolerance * size:
                 return lam
             Ap = product(p)
             # orthogonal in the norm of the preconditioned residual

@@ -21,7 +21,7 @@ from physics3d.materials.base import Values
 from physics3d.matter import Matter, in_one_piece, of_particles, points
 from physics3d.modes import basis, cubature, lattice, vibration
 from physics3d.modes.conditions import Conditions, Refused, conditions
-from physics3d.modes.dynamics import Spring, System
+from physics3d.modes.dynamics import TOLERANCE, Spring, System
 from physics3d.modes.stress import Points
 from physics3d.world import World
 
@@ -74,6 +74,7 @@ class Model:
             points=Points(self.world.material, coefficients, self.weight),
             springs=self.springs,
             drag=self.world.damping,
+            tolerance=TOLERANCE[self.world.dtype],
         )
 
     def at_points(self, coefficients: Tensor) -> Tensor:
@@ -167,7 +168,10 @@ def model(
     log.info(
         f"{len(matter.position)} pieces, {splines.count} splines {1e3 * splines.H:.3g} mm apart, {len(weight)} points"
     )
-    swings = exact > 1e3 * shift  # no rigid motion
+    # Rayleigh's quotients: what was added to keep the matrix regular changes shapes a little, and these not at all
+    elastic = K + _three(permanent)
+    exact = np.maximum(np.einsum("nm,nm->m", shapes, elastic @ shapes), 0.0)
+    swings = np.ones(len(exact), bool) if held else exact > 1e-3 * exact[6]  # no rigid motion
     fields = [shapes[:, swings]]
     sources = [*load_fields] + ([first_moment] if any(world.gravity) else [])
     responses = _responses((K + _three(rest) + shift * M).tocsr(), sources)
@@ -191,7 +195,9 @@ def model(
     if group.max() + 1 > MOST_GROUPS:  # a field of parameters: every particle counts
         which, factor = np.arange(len(weight)), np.ones(len(weight))
     else:
-        which, factor = cubature.chosen(slopes_there, tangent, K + np.kron(C.T @ (rest @ C), np.eye(3)), group, points_)
+        whole = K + np.kron(C.T @ (rest @ C), np.eye(3))
+        _, own_modes = vibration.dense_modes(whole, np.kron(C.T @ (scalar_mass @ C), np.eye(3)), modes, shift=shift)
+        which, factor = cubature.chosen(slopes_there, tangent, whole, own_modes, group, points_)
     slopes_there = np.ascontiguousarray(slopes_there.reshape(len(weight), 3, -1)[which].reshape(3 * len(which), -1))
     K = vibration.stiffness(slopes_there, tangent[:, which] * factor[:, None, None])
     K += np.kron(C.T @ (permanent @ C), np.eye(3))

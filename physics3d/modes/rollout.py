@@ -116,8 +116,8 @@ class Solver:
     def statics(
         self, parameters: Values, load: AbstractBoundary | None = None, *, gravity: bool = False
     ) -> Float[Tensor, "p 3"]:
-        """Displacement of the particles [m] in equilibrium, a long time after the force of `load`, one of the excitation,
-        and gravity have begun to act. Raises ValueError if there is none."""
+        """Displacement of the particles [m] in equilibrium, a long time after the force of `load`, one of the
+        excitation, and gravity have begun to act. Raises ValueError if there is none."""
         body, loads = self.model, self._loads().detach().numpy()
         total = np.zeros((body.count, 3))
         if gravity:

@@ -17,6 +17,7 @@ import warp as wp
 from jaxtyping import Float
 
 from physics3d.materials.base import AbstractMaterial
+from physics3d.warp_start import start_warp
 
 
 class Points:
@@ -25,8 +26,7 @@ class Points:
     def __init__(
         self, material: AbstractMaterial, coefficients: Float[np.ndarray, "k n"], weight: Float[np.ndarray, " n"]
     ):
-        wp.config.quiet = True
-        wp.init()
+        start_warp()
         n = len(weight)
         self.material, self.n = material, n
         self.rows = material.memory_rows
@@ -130,13 +130,13 @@ def _kernels(function: wp.Function) -> tuple[tuple[wp.Kernel, tuple[str, ...], t
         # in
         dt: wp.float64,  # [s]
         L: wp.array(dtype=wp.mat33d),  # velocity gradient [1/s]
-        H_0: wp.array(dtype=wp.mat33d),  # transposed, at the start
-        coefficients: wp.array2d(dtype=wp.float64),
-        memory: wp.array2d(dtype=wp.float64),
+        H_0: wp.array(dtype=wp.mat33d),  # [n] F - I transposed, at the start [1]
+        coefficients: wp.array2d(dtype=wp.float64),  # [k, n] of the material
+        memory: wp.array2d(dtype=wp.float64),  # [m, n] internal variables
         # out
-        H_next: wp.array(dtype=wp.mat33d),
+        H_next: wp.array(dtype=wp.mat33d),  # [n] [1]
         tau: wp.array(dtype=wp.mat33d),  # [Pa]
-        memory_next: wp.array2d(dtype=wp.float64),
+        memory_next: wp.array2d(dtype=wp.float64),  # [m, n]
     ):
         p = wp.tid()
         H_p, tau_p = function(p, dt, L[p], wp.transpose(H_0[p]), coefficients, memory, memory_next)
@@ -154,8 +154,8 @@ def _kernels(function: wp.Function) -> tuple[tuple[wp.Kernel, tuple[str, ...], t
 def _rate(
     # in
     dt: wp.float64,  # [s]
-    H: wp.array(dtype=wp.mat33d),  # transposed
-    H_0: wp.array(dtype=wp.mat33d),  # transposed, at the start
+    H: wp.array(dtype=wp.mat33d),  # [n] F - I transposed [1]
+    H_0: wp.array(dtype=wp.mat33d),  # [n] F - I transposed, at the start [1]
     # out
     L: wp.array(dtype=wp.mat33d),  # [1/s]
 ):
@@ -167,9 +167,9 @@ def _rate(
 @wp.kernel
 def _force(
     # in
-    dt: wp.float64,
+    dt: wp.float64,  # [s]
     tau: wp.array(dtype=wp.mat33d),  # [Pa]
-    H: wp.array(dtype=wp.mat33d),  # transposed
+    H: wp.array(dtype=wp.mat33d),  # [n] F - I transposed [1]
     weight: wp.array(dtype=wp.float64),  # [m^3]
     # out
     P: wp.array(dtype=wp.mat33d),  # transposed [J]

@@ -7,7 +7,7 @@ long dt that of the springs that never relax. In between, kappa(t) = phi^T K(t) 
 relaxation of the mode, and its complex stiffness and loss factor are
 
     kappa*(omega) = kappa(inf) + i omega int_0^inf (kappa(t) - kappa(inf)) e^(-i omega t) dt,    omega^2 = Re kappa*,
-    eta = Im kappa* / Re kappa*                                                (an oscillation decays as e^(-eta omega t/2))
+    eta = Im kappa* / Re kappa*                              (an oscillation decays as e^(-eta omega t/2))
 """
 
 from collections.abc import Callable
@@ -22,7 +22,7 @@ from physics3d.materials.base import AbstractMaterial
 from physics3d.modes.stress import Points
 
 STUCK, RELAXED = 1e-12, 1e12  # [s]
-FAINT = 1e-12  # of the stiffness of a function full of matter
+FAINT = 1e-10  # of the stiffness of a function full of matter
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,6 +6,7 @@ exp(-damping dt), then the signals of the boundaries.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -55,7 +56,7 @@ class Arrays:
         self.row_count: int = len(coefficients)
         self.mass_floor: float = 1e-12 * float(mass.mean())  # [kg], of nodes
         vec3 = vector(self.real)
-        self.constant: dict[str, wp.array] = {
+        self.constant: dict[str, Any] = {
             "mass": wp.from_torch(mass),
             "volume": wp.from_torch(volume),
             "cell": wp.from_torch(cell, dtype=wp.vec3i),
@@ -69,8 +70,8 @@ class Arrays:
         self.walls: wp.array = self.zeros(12, wp.int32)
         if walls is not None:
             self.walls.assign(np.array(walls, np.int32))
-        self.gravity: wp.vec3f | wp.vec3d = vec3(*gravity)
-        self.origin: wp.vec3f | wp.vec3d = vec3(*origin)
+        self.gravity: Sequence[float] = vec3(*gravity)
+        self.origin: Sequence[float] = vec3(*origin)
         self.clock: wp.array = self.zeros((longest_run, FIRST_SIGNAL + hooks.signals), self.real)
         self.v_pushed: wp.array | None = self.zeros(self.n, vec3) if hooks.push else None
         self.states: list[State] = []

@@ -2,6 +2,7 @@
 
 import os
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 import warp as wp
@@ -43,7 +44,7 @@ class Body:
 def make_body(problem: Problem, coefficients: Tensor, q: Tensor, position: Tensor) -> Body:
     """`coefficients` [k, p], `q` parameters of the boundaries, `position` [p, 3] at rest in float64, sorted by cell."""
     world, setting = problem.world, problem.setting
-    kind = {"device": problem.device, "dtype": world.dtype}
+    kind: dict[str, Any] = {"device": problem.device, "dtype": world.dtype}
     origin = setting.position.new_tensor(setting.lower)
     cells = (position - origin.to(position.device)) / world.dx
     cell = cells.floor()

@@ -12,6 +12,7 @@ and the same windows.
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -84,7 +85,7 @@ class Frames:
         first.L_gathered.copy_(gradient)
         self.initial = first.flat.clone() if self.keep else None
         self.substeps.start(self._clock(0.0, 0.0, 1), 0, 0)
-        kind = {"dtype": world.dtype, "device": self.problem.device}
+        kind: dict[str, Any] = {"dtype": world.dtype, "device": self.problem.device}
         u, deformation = torch.empty((frames, n, 3), **kind), torch.empty((frames, n, 3, 3), **kind)
         eye = torch.eye(3, **kind)
         for frame in self.problem.log.progress(range(frames), "simulate"):

@@ -43,7 +43,10 @@ class Hooks:
 
 def hooks_of(boundaries: Sequence[AbstractBoundary], widths: Sequence[int], real: type) -> Hooks:
     """`widths`: how many parameters each boundary has in q."""
-    push, touch, node, steer = [], [], [], []
+    push: list[Hook] = []
+    touch: list[Hook] = []
+    node: list[Hook] = []
+    steer: list[Hook] = []
     parameter, signal = 0, FIRST_SIGNAL
     for row, (boundary, width) in enumerate(zip(boundaries, widths, strict=True)):
         for place, function in (

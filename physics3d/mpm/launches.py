@@ -49,7 +49,7 @@ def record(
 
 def launch_over(launch: wp.Launch, first: int, count: int) -> None:
     """Launch over the `count` threads from `first` on."""
-    if launch.bounds.size != count:
+    if launch.bounds.size != count:  # type: ignore[attr-defined]  # a structure of C
         launch.set_dim(count)
     launch.set_param_by_name("first", first)
     launch.launch()

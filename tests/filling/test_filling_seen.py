@@ -94,7 +94,7 @@ def test_distances_are_those_of_the_surface(rng):
 
 
 # [spacings] standard deviation of Gaussians across their disc; fits of plain surfaces have them as broad as particles
-BREADTHS = [0.3, 1.0, 1.5, 2.0]
+BREADTHS = [0.3, 1.0, 2.0]
 
 
 @pytest.mark.parametrize("seen_by", ["cameras", "nobody"])

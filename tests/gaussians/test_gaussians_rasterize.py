@@ -352,7 +352,7 @@ def test_non_finite_input_is_refused_by_name(index, bad):
         rasterize(*arrays, camera(), background=BACKGROUND)
 
 
-def test_a_wrong_shape_is_refused_by_name():
+def test_a_wrong_shape_is_refused_by_name(unchecked):
     mean, covariance, opacity, color = cloud(5)
     with pytest.raises(ValueError, match="opacity has shape"):
         rasterize(mean, covariance, opacity[:, None], color, camera(), background=BACKGROUND)

@@ -186,7 +186,7 @@ def test_small_strains_have_the_moduli_of_the_handbook(material, rng):
     strain = 1e-7 * random(rng, 6, 3, 3)
     strain = strain + strain.mT
     strain = strain - (strain.diagonal(dim1=1, dim2=2).mean(1) + 2e-6)[:, None, None] * ONE
-    tau, _, _ = walk(material, torch.zeros_like(strain), [strain], dt=1e-12)
+    (tau,), _, _ = walk(material, torch.zeros_like(strain), [strain], dt=1e-12)
     trace = strain.diagonal(dim1=1, dim2=2).sum(1)[:, None, None]
     expected = 2 * mu * strain + lam * trace * ONE
     if isinstance(material, Newtonian):
@@ -222,7 +222,8 @@ def test_adjoint_is_the_derivative(material, rng):
     weights = [random(rng, n, 3, 3), random(rng, n, 3, 3) / unit, random(rng, *memory.shape)]
 
     def functional(inputs):
-        H_next, tau, memory_next = advance(material, 0.05, *inputs)
+        # no relaxation time of the samples: longer steps store the strain in another form
+        H_next, tau, memory_next = advance(material, 0.04, *inputs)
         terms = (weights[0] * H_next).sum((1, 2)), (weights[1] * tau).sum((1, 2)), (weights[2] * memory_next).sum(0)
         return sum(terms)
 

@@ -54,8 +54,9 @@ def turned_beam(
 def timoshenko(
     length: float, area: float, inertia: float, young: float, poisson: float, density: float, shear: float, free: bool
 ) -> list[float]:
-    """The first two frequencies of bending [Hz] of a beam clamped at one end, or free; `shear` is the coefficient of the
-    section. The determinant of the transfer matrix of (w, phi, M, Q) vanishes where both ends have what they must."""
+    """The first two frequencies of bending [Hz] of a beam clamped at one end, or free; `shear` is the coefficient
+    of the section. The determinant of the transfer matrix of (w, phi, M, Q) vanishes where both ends
+    have what they must."""
     G = young / (2 * (1 + poisson))
     scale = np.array([1, 1 / length, young * inertia / length**2, young * inertia / length**3])
 

@@ -176,8 +176,10 @@ def make_loss(world, *, frame_dt: float, speed: float, excitation=()):
     generator = torch.Generator().manual_seed(0)
     a, b = (torch.randn(3, 64, 3, *tail, generator=generator, dtype=torch.float64) for tail in ((), (3,)))
 
+    signs = {name: math.copysign(1.0, value) for name, value in world.start.items()}
+
     def loss(*, velocity, place, force=None, **logs):
-        parameters = {name: value.exp() for name, value in logs.items()}
+        parameters = {name: signs[name] * value.exp() for name, value in logs.items()}
         extra = () if force is None else (dataclasses.replace(PUSH, force=force),)
         trajectory = rollout(
             world, parameters, position + 0.1 * DX * place, volume, velocity=speed * velocity,
@@ -186,7 +188,7 @@ def make_loss(world, *, frame_dt: float, speed: float, excitation=()):
         return (a * (trajectory.position - position)).sum() / DX + (b * trajectory.deformation).sum()
 
     inputs = {"velocity": shaken(64, 1.0) + position.flip(1) / DX, "place": shaken(64, 1.0).flip(1)}
-    return loss, inputs | {name: value.log() for name, value in tensors(world.start).items()}
+    return loss, inputs | {name: value.abs().log() for name, value in tensors(world.start).items()}
 
 
 @pytest.mark.parametrize("boundary", every_boundary(), ids=lambda b: f"{type(b).__name__}-{getattr(b, 'kind', '')}")

@@ -219,12 +219,12 @@ def test_touching_gaussians_are_those_next_to_static_ones():
 @pytest.mark.parametrize(
     ("prompt", "remedy"),
     [
-        ({"positive": ((1.2, 0.5),)}, "is outside the image; give fractions"),
-        ({"box": (10, 20, 200, 300)}, "as fractions of width and height"),
+        ({"positive": ((1.2, 0.5),)}, "positive.0.0 is 1.2; take a number >= 0 and <= 1"),
+        ({"box": (10, 20, 200, 300)}, "box.0 is 10; take a number >= 0 and <= 1"),
         ({"box": (0.6, 0.1, 0.3, 0.9)}, "left < right"),
-        ({"lower": (0, 0, 0)}, "both lower and upper"),
+        ({"lower": (0, 0, 0)}, "take both corners, or neither"),
         ({"lower": (0, 0, 1), "upper": (1, 1, 0)}, "below upper"),
-        ({}, "give positive points, a box, or"),
+        ({}, "take at least one of positive, box, lower"),
     ],
 )
 def test_a_prompt_that_cannot_be_is_refused(prompt, remedy):

@@ -147,13 +147,20 @@ def determinant(A: Float[Tensor, "n 3 3"]) -> Float[Tensor, " n"]:
     return (torch.linalg.cross(A[:, 0], A[:, 1]) * A[:, 2]).sum(1)
 
 
-def isochoric_strain(H: Float[Tensor, "n 3 3"], J: Float[Tensor, " n"]) -> Float[Tensor, "n 3 3"]:
-    """b~ - I of many F = I + H of the volume J, as `isochoric`."""
+def change(H: Float[Tensor, "n 3 3"]) -> Float[Tensor, " n"]:
+    """J - 1 of many F = I + H, as `volume_change`."""
+    trace = H.diagonal(dim1=1, dim2=2).sum(1)
+    return trace + (trace**2 - (H * H.mT).sum((1, 2))) / 2 + determinant(H)
+
+
+def isochoric_strain(H: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 3 3"]:
+    """b~ - I of many F = I + H, as `isochoric`."""
     X = H + H.mT + H @ H.mT
-    scale = torch.expm1(-2 / 3 * J.clamp(min=LEAST_J).log())[:, None, None]
+    scale = torch.expm1(-2 / 3 * torch.log1p(change(H).clamp(min=LEAST_J - 1)))[:, None, None]
     return X + scale * (torch.eye(3, dtype=H.dtype, device=H.device) + X)
 
 
-def volumetric_energy(j: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-    """[(J^2 - 1)/2 - ln J]/2 of j = J - 1, per bulk modulus; its stress is (J^2 - 1)/2."""
+def volumetric_energy(H: Float[Tensor, "n 3 3"]) -> Float[Tensor, " n"]:
+    """[(J^2 - 1)/2 - ln J]/2 of many F = I + H, per bulk modulus; its stress is (J^2 - 1)/2."""
+    j = change(H)
     return (j + j**2 / 2 - torch.log1p(j.clamp(min=1e-30 - 1))) / 2

@@ -13,7 +13,7 @@ from physics3d.mpm.arrays import Arrays
 from physics3d.mpm.implicit.diagonal import diagonal
 from physics3d.mpm.implicit.stiffness import stiffness
 from physics3d.mpm.implicit.stress import stress, stress_adjoint
-from physics3d.mpm.launches import Arguments, record
+from physics3d.mpm.launches import Arguments, launch_over, record
 from physics3d.mpm.substep import Substeps
 from physics3d.mpm.threads import Wait, on_all
 from physics3d.warp_types import matrix, vector, vector4
@@ -81,9 +81,7 @@ class StepLaunches:
     def on_nodes(self, name: str) -> None:
         launch = self._launch(name, 0)
         assert launch is not None
-        if launch.bounds.size != self.arrays.node_count:
-            launch.set_dim(self.arrays.node_count)
-        launch.launch()
+        launch_over(launch, 0, self.arrays.node_count)
 
     def _launch(self, name: str, w: int) -> wp.Launch | None:
         key = (name, w, *self.pair, self.side)
@@ -133,12 +131,12 @@ class StepLaunches:
             "stress_adjoint": (
                 stress_adjoint(real), dict(first=first, L=b["L"], T=self.T, adjoint_T=self.E, **outputs), None,
             ),
-            "advance_adjoint": self._back("advance", w, L=own["L"], tau=own["tau"]),
-            "steer_adjoint": self._back("steer", w, **gathered, v=own["v"], L=own["L"]),
+            "advance_adjoint": self._back("advance", w, dict(L=own["L"], tau=own["tau"])),
+            "steer_adjoint": self._back("steer", w, dict(**gathered, v=own["v"], L=own["L"])),
             "diagonal": (diagonal(real), dict(first=first, u=a["u"], moduli=self.moduli, blocks=self.blocks[w]), None),
             "stiffness": (stiffness(real), dict(first=first, u=a["u"], C=self.C, w=self.w, Kw=self.Kw[w]), None),
-            "probe": self._back("update", w, **probe),
-            "probe_still": self._back("update", w, dict(gravity=vector(real)()), **probe),
+            "probe": self._back("update", w, probe),
+            "probe_still": self._back("update", w, probe, gravity=vector(real)()),
         }  # fmt: skip
 
     def _backward(self, w: int, adjoint: Adjoint) -> dict[str, Call | None]:
@@ -158,14 +156,14 @@ class StepLaunches:
         spread = transfer.scatter_adjoint(real)
         gather = transfer.gather_adjoint(real)
         return {
-            "advance_back": self._back("advance", w, **explicit["advance"]),
-            "steer_back": self._back("steer", w, **explicit["steer"]),
+            "advance_back": self._back("advance", w, explicit["advance"]),
+            "steer_back": self._back("steer", w, explicit["steer"]),
             "gather_back": (
                 gather,
                 dict(first=first, u=u, adjoint_v=later["v_gathered"], adjoint_L=later["L_gathered"], **onto),
                 None,
             ),
-            "update_back": self._back("update", w, **explicit["update"]),
+            "update_back": self._back("update", w, explicit["update"]),
             "force_back": (
                 spread,
                 _inputs(self._force(w))
@@ -180,8 +178,8 @@ class StepLaunches:
                 dict(first=first, L=b["L"], T=self.T, adjoint_T=own["T"], adjoint_tau=own["tau"], adjoint_L=own["L"]),
                 None,
             ),
-            "advance_again": self._back("advance", w, **material, L=own["L"], tau=own["tau"]),
-            "steer_again": self._back("steer", w, **at, **gathered, v=own["v"], L=own["L"]),
+            "advance_again": self._back("advance", w, dict(**material, L=own["L"], tau=own["tau"])),
+            "steer_again": self._back("steer", w, dict(**at, **gathered, v=own["v"], L=own["L"])),
             "gather_again": (
                 gather, dict(first=first, u=u, adjoint_v=own["v_gathered"], adjoint_L=own["L_gathered"], **onto), None,
             ),
@@ -194,15 +192,16 @@ class StepLaunches:
                 ),
                 None,
             ),
-            "push_back": self._back("push", w, **explicit["push"]),
+            "push_back": self._back("push", w, explicit["push"]),
         }  # fmt: skip
 
-    def _back(self, kernel: str, w: int, changed: Arguments | None = None, **adjoints: wp.array) -> Call | None:
-        """The generated adjoint of a kernel of the substep, with adjoint arrays for some of its arguments."""
+    def _back(self, kernel: str, w: int, adjoints: Arguments, **changed: object) -> Call | None:
+        """The generated adjoint of a kernel of the substep, with adjoint arrays for some of its arguments; `changed`
+        are arguments that are other ones than in the substep."""
         if kernel not in self.substeps.kernels:
             return None
         arguments = self.substeps.arguments(w, *self.pair)[kernel]
-        return self.substeps.kernels[kernel], arguments | dict(changed or {}), adjoints
+        return self.substeps.kernels[kernel], arguments | changed, adjoints
 
     def _inertia(self, w: int) -> dict[str, object]:
         """Of a scatter without stress."""

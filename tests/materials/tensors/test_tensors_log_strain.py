@@ -13,12 +13,13 @@ from physics3d.warp_types import matrix
 
 @functools.cache
 def kernel(real):
-    mat33, relax = matrix(real), log_strain.relax(real)
+    mat33, rescale = matrix(real), log_strain.rescale(real)
 
     @wp.kernel(module="unique")
     def evaluate(X: wp.array(dtype=mat33), d: real, v: real, eps: wp.array(dtype=mat33), X_next: wp.array(dtype=mat33)):
         p = wp.tid()
-        a, b = relax(X[p], d, v)
+        half_d, half_v = wp.exp(-real(0.5) * d), wp.exp(-real(0.5) * v)
+        a, b = rescale(X[p], half_d, half_v, half_d * half_d - real(1.0), half_v * half_v - real(1.0))
         eps[p] = a
         X_next[p] = b
 
