@@ -9,6 +9,7 @@ of your own. Addresses of this machine go round any proxy.
 import fcntl
 import os
 import resource
+import signal
 import socket
 import subprocess
 import sys
@@ -21,7 +22,7 @@ from pathlib import Path
 
 HERE = ("localhost", "127.0.0.1", "::1")
 FILES = 256  # that this process and the server each hold open, at least
-PATIENCE = 180  # a first start creates the database, on a busy machine [s]
+PATIENCE = 600  # a first start creates the database, on a machine that may be busy with ten other things [s]
 SETTINGS = {
     "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
     "PREFECT_TELEMETRY_ENABLE_RESOURCE_METRICS": "false",
@@ -122,5 +123,5 @@ def _stop(process: subprocess.Popen) -> None:
     process.stdin.close()
     try:
         process.wait(timeout=10)
-    except subprocess.TimeoutExpired:
-        process.kill()
+    except subprocess.TimeoutExpired:  # the shell and the server, which are a group of their own
+        os.killpg(process.pid, signal.SIGKILL)
