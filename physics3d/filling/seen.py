@@ -6,8 +6,8 @@ is its pictures. A camera tells of a point x at depth z, with the pixel it falls
     outline    (1/2 - m) / |slope of m|, m the share of the pixel that is the body's: where m < 1/2, x is not the body's
                unless something static hides it
     depth      d - z where z < d + t: in front of what is seen there, or just behind it; d is where the pixel's ray
-               meets the Gaussian at which half the light is gone, if that is the body's, less twice its deviation along
-               the ray: its centre may be as far beside the ray as it is broad
+               meets the Gaussian at which half the light is gone, if that is the body's, less FRONT deviations along the
+               ray: its centre may be as far beside the ray as it is broad
 
 Outlines exclude: the distance is the largest but for a tenth of the cameras, so that a few mistaken masks carve
 nothing. Depths are uncertain: the distance is their mean, cut off at the truncation t (Curless and Levoy 1996). The
@@ -34,6 +34,9 @@ MOST_POINTS = 3_000_000  # of the lattice
 PER_SPACING = 3  # points of the lattice
 EDGE = 2.0  # [px] over which the share of an edge falls from 1 to 0: low pass, pixel and the Gaussians' own slope
 LIMB = 2.0  # deviations by which the outlines of layers of Gaussians lie outside of their centres
+# deviations by which their near side lies before them: 3 make balls of Gaussians at known depths as large as their
+# pictures, 4 the stem of the reconstructed carnation as thick as it is
+FRONT = 3.5
 FAR = 1e6  # depth where nothing is seen [m]
 
 
@@ -159,7 +162,7 @@ def _front(
     densest = (towards * away).sum(1) / (towards * d).sum(1)
     deviation = torch.einsum("ni,nij,nj->n", d, torch.linalg.inv(shape[which]), d).rsqrt()
     front = torch.full(at.shape, FAR)
-    front[chosen] = (densest - LIMB * deviation).float()
+    front[chosen] = (densest - FRONT * deviation).float()
     return front
 
 

@@ -114,14 +114,15 @@ def test_a_sheet_of_broad_gaussians_has_its_area(breadth, seen_by, rng):
 @pytest.mark.xfail(strict=False, reason="the broadest Gaussians leave the ball 4 to 12 per cent small")
 @pytest.mark.parametrize("breadth", BREADTHS)
 def test_a_ball_of_broad_gaussians_has_its_volume(breadth, rng):
-    """By itself it is the ball on which discs lie; with cameras it is what they see, which broad discs enlarge."""
+    """By itself it is the ball on which its discs lie. Their rims show around it: cameras see it a little larger."""
     point, normal = sphere(3000, RADIUS, rng)
     gaussians, cameras = discs(point, normal, rng, sigma=breadth * SPACING), around(16)
     radius = lambda body: (float(body.volume.double().sum()) * 3 / (4 * np.pi)) ** (1 / 3)
     # the rim of a disc lies sigma^2/2R outside of the ball
     assert RADIUS - 3e-4 < radius(filled(gaussians, ())) < RADIUS + (breadth * SPACING) ** 2 / (2 * RADIUS) + 3e-4
-    # three quarters of a pixel, as for small ones
-    assert radius(filled(gaussians, cameras)) == pytest.approx(radius_in_pictures(gaussians, cameras), abs=1.2e-3)
+    # the discs' faces are where they are, whatever their rims do to outlines, which are the most that may be filled
+    rims = radius_in_pictures(gaussians, cameras) - RADIUS
+    assert -3e-4 < radius(filled(gaussians, cameras)) - RADIUS < 0.6 * rims
 
 
 @pytest.mark.parametrize("breadth", BREADTHS)
