@@ -92,7 +92,7 @@ def _stress_flow(real: type) -> wp.Function:
     mat33 = matrix(real)
     log_det, unimodular_inverse = volume.log_det(real), volume.unimodular_inverse(real)
     expm1, log1p = scalars.expm1(real), scalars.log1p(real)
-    least, most = real(1e-26), real(60.0)
+    least, most = real(1e-6 if real is wp.float32 else 1e-15), real(60.0)
 
     @wp.func(name=f"stress_flow_{real.__name__}")
     def decayed(X: mat33, d: real, v: real):
