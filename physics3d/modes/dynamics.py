@@ -157,6 +157,8 @@ class System:
         residual = lambda y: inertia(y) + self.force(y, after) + self._held(y, t)[0] - load
         before = self.points.state() if keep is not None else None
         inertial = 4 / dt**2 + 2 * c / dt
+        # a step at the present speed, in the same norm
+        self.scale = max(self.scale, float(np.sqrt(max(np.vdot(v, self.mass @ v), 0.0))))
         try:
             x = self._solve(q + dt / 2 * v, residual, inertial, after, t)
         except NotSolved:  # going straight on may stretch what in truth turns
