@@ -3,10 +3,10 @@
     V = int dX,   X_c = 1/V int X dX,   S = 1/V int (X - X_c) (X - X_c)^T dX        [m^3], [m], [m^2]
 
 A piece is what one lattice cell holds of the body, or a particle: a cube of its volume, unless something better is
-known. It is integrated at the eight points X_c + S^(1/2) (+-1, +-1, +-1), which have its volume, centroid and second
-moment, so that a part thinner than a cell bends as it should. (Its midpoint alone would lose 1/n^2 of the second
-moment of a section n pieces across.) Two pieces are linked where matter of one touches matter of the other: what lies
-across a gap is not.
+known. It is integrated as the cuboid of this volume, centroid and second moment, exactly to the fifth degree at 14
+points (Irons 1971), so that a part thinner than a cell bends as it should. (Its midpoint alone would lose 1/n^2 of the
+second moment of a section n pieces across; eight points do not see how a section one piece across can warp.) Two pieces
+are linked where matter of one touches matter of the other: what lies across a gap is not.
 """
 
 from dataclasses import dataclass, replace
@@ -136,12 +136,16 @@ def in_one_piece(matter: Matter) -> Matter:
 
 
 def points(matter: Matter) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(X [n, 3] m, weight [n] m^3, piece [n]): eight points of every piece."""
+    """(X [n, 3] m, weight [n] m^3, piece [n]): 14 points of every piece."""
     value, axes = np.linalg.eigh(matter.moment.numpy())
     root = (axes * np.sqrt(np.maximum(value, 0))[:, None]) @ axes.transpose(0, 2, 1)
     corner = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3, indexing="ij"), -1).reshape(8, 3)
-    X = matter.position.numpy()[:, None] + np.einsum("mij,kj->mki", root, corner)
-    return X.reshape(-1, 3), np.repeat(matter.volume.numpy() / 8, 8), np.repeat(np.arange(len(X)), 8)
+    place = np.concatenate([np.sqrt(19 / 30) * np.eye(3), -np.sqrt(19 / 30) * np.eye(3), np.sqrt(19 / 33) * corner])
+    share = np.array([320 / 361] * 6 + [121 / 361] * 8) / 8
+    # half an edge is sqrt(3) deviations
+    X = matter.position.numpy()[:, None] + np.einsum("mij,kj->mki", root, np.sqrt(3) * place)
+    weight = matter.volume.numpy()[:, None] * share
+    return X.reshape(-1, 3), weight.reshape(-1), np.repeat(np.arange(len(X)), len(share))
 
 
 def with_particles(

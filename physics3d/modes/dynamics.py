@@ -79,6 +79,19 @@ class _Matrix:
 
 
 @dataclass
+class _Way:
+    """A step of Newton's method, and A times it."""
+
+    way: np.ndarray
+    force: np.ndarray
+
+    @property
+    def size(self) -> float:
+        """Its square in the norm of A."""
+        return float(np.vdot(self.way, self.force)) or 1e-300
+
+
+@dataclass
 class System:
     """A body in a basis of r functions."""
 
@@ -95,6 +108,7 @@ class System:
     _matrix: _Matrix | None = field(default=None, repr=False)
     _matrix_of: tuple = ()
     _K: object = field(default=None, repr=False)
+    _past: list[tuple[float, np.ndarray]] = field(default_factory=list, repr=False)  # the last midpoints
 
     def __post_init__(self):
         self._back = self.gradient.T.copy()
@@ -111,6 +125,7 @@ class System:
         except NotSolved:
             self.points.set_state(begin[0])
             self.since = begin[1]
+            self._past = []
             raise
         return q, v
 
@@ -157,16 +172,26 @@ class System:
         residual = lambda y: inertia(y) + self.force(y, after) + self._held(y, t)[0] - load
         before = self.points.state() if keep is not None else None
         inertial = 4 / dt**2 + 2 * c / dt
+        # a step at the present speed, in the same norm
+        self.scale = max(self.scale, float(np.sqrt(max(np.vdot(v, self.mass @ v), 0.0))))
         try:
-            x = self._solve(q + dt / 2 * v, residual, inertial, after, t)
+            x = self._solve(self._guess(q, v, dt), residual, inertial, after, t)
         except NotSolved:  # going straight on may stretch what in truth turns
             self._refresh(q, after, (inertial, self._held(q, t)[1]))
             x = self._solve(q, residual, inertial, after, t)
+        self._past = [*self._past[-2:], (dt, x)]
         if keep is not None:
             keep.append(_Taken(step, after, x, before, self._matrix))
         self.points.keep()
         self.since = dt / 2
         return 2 * x - q, (4 / dt) * (x - q) - v
+
+    def _guess(self, q: np.ndarray, v: np.ndarray, dt: float) -> np.ndarray:
+        """The coming midpoint: on the parabola through the last three, for what turns does not go straight on."""
+        if len(self._past) == 3 and all(old == dt for old, _ in self._past):
+            (_, a), (_, b), (_, c) = self._past
+            return 3 * (c - b) + a
+        return q + dt / 2 * v
 
     def _solve(self, x, residual, inertia: float, after: float, t: float) -> np.ndarray:
         """The root of the residual near x; the points are left at it."""
@@ -179,16 +204,16 @@ class System:
         r = residual(x)
         step, error = self._newton(r, [])
         self.scale = max(self.scale, error)
-        steps: list[np.ndarray] = []  # taken with the present matrix
+        steps: list[_Way] = []  # taken with the present matrix
         for _ in range(MOST_ITERATIONS):
             self.iterations += 1
             if error <= self.tolerance * self.scale:
                 return x
             share = 1.0
             while True:
-                y = x - share * step
+                y = x - share * step.way
                 r_new = residual(y)
-                new, new_error = self._newton(r_new, [*steps, -step] if share == 1 else [])
+                new, new_error = self._newton(r_new, [*steps, step] if share == 1 else [])
                 if new_error < (1 - share / 4) * error:
                     break
                 if steps or not fresh:
@@ -203,7 +228,7 @@ class System:
                 else:
                     raise NotSolved("Newton's method finds no step that lessens the error")
             slow = new_error > SLOW * error
-            steps = [*steps, -step] if share == 1 else []
+            steps = [*steps, step] if share == 1 else []
             x, r, step, error, fresh = y, r_new, new, new_error, False
             if slow:
                 self._refresh(x, after, which)
@@ -211,18 +236,20 @@ class System:
                 step, error = self._newton(r, [])
         raise NotSolved(f"Newton's method does not converge in {MOST_ITERATIONS} iterations")
 
-    def _newton(self, r: np.ndarray, steps: list[np.ndarray]) -> tuple[np.ndarray, float]:
+    def _newton(self, r: np.ndarray, steps: list["_Way"]) -> tuple["_Way", float]:
         """(the next step to subtract, the size of A^-1 r in the norm of A); infinite where the residual is no number.
-        Broyden's update by the steps so far (Kelley 1995, sec. 7.3)."""
+        Broyden's update by the steps so far (Kelley 1995, sec. 7.3), in the inner product of A."""
         if not np.isfinite(r).all():
-            return r, np.inf
-        step = self._matrix.solve(r)
-        error = float(np.sqrt(abs(np.vdot(step, r))))
+            return _Way(r, r), np.inf
+        way, force = self._matrix.solve(r), r
+        error = float(np.sqrt(abs(np.vdot(way, r))))
         for s, after in itertools.pairwise(steps):
-            step = step + after * (np.vdot(s, step) / np.vdot(s, s))
+            share = np.vdot(s.force, way) / s.size
+            way, force = way + share * after.way, force + share * after.force
         if steps:
-            step = step / (1 + np.vdot(steps[-1], step) / np.vdot(steps[-1], steps[-1]))
-        return step, error
+            factor = 1 / (1 - np.vdot(steps[-1].force, way) / steps[-1].size)
+            way, force = factor * way, factor * force
+        return _Way(way, force), error
 
     def _refresh(self, x, after: float, which: tuple) -> None:
         D = self.points.tangent((self.gradient @ x).reshape(-1, 3, 3), after)

@@ -25,11 +25,12 @@ from physics3d.modes.dynamics import TOLERANCE, Spring, System
 from physics3d.modes.stress import Points
 from physics3d.world import World
 
-CELL = (2, 3, 4, 6, 8)  # spacing of the splines, in edges of a piece: the first with at most MOST_SPLINES of them
+CELL = (1, 1.5, 2, 3, 4, 6, 8)  # spacing of the splines, in edges of a piece: the first with at most MOST_SPLINES of them
 MOST_SPLINES = 1500
 PIN = 1e3  # stiffness of a pin, in that of a cube of the piece behind it
 MODES = 12  # of vibration, whose components are fields of the basis
 QUADRATURE = 500  # points of integration
+SMOOTH = 30.0  # times the highest mode: what would swing faster is smoothed out of a start
 MOST_GROUPS = 8  # materials that differ; more are a field
 
 
@@ -45,6 +46,7 @@ class Model:
     weight: np.ndarray  # [n] [m^3]
     owner: np.ndarray  # [n] particle
     mass: np.ndarray  # [r, r] [kg]
+    stiffness: np.ndarray  # at rest, pins included, all dash-pots stuck [3 r, 3 r] [N/m]
     first_moment: np.ndarray  # int rho s_j [r] [kg]
     load_fields: np.ndarray  # int rho s_j weight of each load [b, r] [kg]
     springs: tuple[Spring, ...]
@@ -55,12 +57,17 @@ class Model:
 
     @functools.cached_property
     def projection(self) -> np.ndarray:
-        """[r, free particles]: amplitudes of the field that is nearest, by mass, to given vectors at the particles."""
+        """[3 r, 3 free particles]: amplitudes of the smoothest field that has given vectors at the particles,
+
+            minimise sum_p m_p |sum_j s_j(X_p) a_j - v_p|^2 + a.K a/(SMOOTH omega_max)^2
+
+        What the particles do not say, how a section one particle across turns, is then as the body would have it."""
         free = ~self.conditions.held
         S = self.values[free]
         left = S.T * self.particle_mass[free]
-        gram = left @ S
-        return np.linalg.solve(gram + 1e-8 * np.trace(gram) / len(gram) * np.eye(len(gram)), left)
+        matrix = np.kron(left @ S, np.eye(3)) + self.stiffness / (SMOOTH * self.omega.max()) ** 2
+        matrix += 1e-12 * np.trace(matrix) / len(matrix) * np.eye(len(matrix))
+        return np.linalg.solve(matrix, np.kron(left, np.eye(3)))
 
     @property
     def count(self) -> int:
@@ -174,7 +181,8 @@ def model(
     swings = np.ones(len(exact), bool) if held else exact > 1e-3 * exact[6]  # no rigid motion
     fields = [shapes[:, swings]]
     sources = [*load_fields] + ([first_moment] if any(world.gravity) else [])
-    responses = _responses((K + _three(rest) + shift * M).tocsr(), sources)
+    rigid = shapes[:, ~swings]
+    responses = _responses((K + _three(rest) + shift * M).tocsr(), sources, M, rigid)
     if responses.size:
         fields.append(responses)
     if found.grips:
@@ -182,11 +190,11 @@ def model(
         everything = (K + _three(gripped)).tocsr()
         _, more = vibration.modes(everything, M, modes, shift=shift)
         pulls = [s.pull.first[:, k] for s in springs if s.pull is not None for k in range(4)]
-        fields += [more, _responses((everything + shift * M).tocsr(), [*sources, *pulls])]
+        fields += [more, _responses((everything + shift * M).tocsr(), [*sources, *pulls], M, rigid[:, :0])]
     scalars = basis.turned(np.concatenate(fields, 1), G, weight)
     if not held:
-        rigid = (splines.affine() - [0, *at.mean(0)]) * [span, 1, 1, 1] / np.sqrt(weight.sum())
-        scalars = np.concatenate([rigid, scalars], 1)
+        affine = (splines.affine() - [0, *at.mean(0)]) * [span, 1, 1, 1] / np.sqrt(weight.sum())
+        scalars = np.concatenate([affine, scalars], 1)
     C = basis.independent(scalars, N, G, weight, span)
     slopes_there, still = G @ C, np.zeros((len(weight), 3, 3))
     tangent = stuck.tangent(still, vibration.STUCK)
@@ -217,6 +225,7 @@ def model(
         weight=weight[which] * factor,
         owner=owner[which],
         mass=mass,
+        stiffness=K,
         first_moment=C.T @ first_moment,
         load_fields=load_fields @ C,
         springs=tuple(_in_basis(s, C) for s in springs),
@@ -252,13 +261,18 @@ def _shift(world: World, modulus: np.ndarray, span: float, held: bool) -> float:
     return (1e-6 if held else 1e-4) * float(np.median(modulus)) / (world.density * span**2)
 
 
-def _responses(K: sparse.csr_matrix, sources: list[np.ndarray]) -> np.ndarray:
-    """Static responses [3 f, 3 k] to each scalar source along each axis."""
+def _responses(K: sparse.csr_matrix, sources: list[np.ndarray], M: sparse.csr_matrix, rigid: np.ndarray) -> np.ndarray:
+    """Static responses [3 f, k] to each scalar source along each axis, relative to the `rigid` motions [3 f, n] of a
+    free body, M-orthonormal: under a force it accelerates, and bends by what the force differs from its inertia."""
     if not sources:
         return np.zeros((K.shape[0], 0))
-    factor = vibration.Factor(K)
-    columns = [np.kron(source[:, None], np.eye(3)[:, [i]]) for source in sources for i in range(3)]
-    return factor(np.concatenate(columns, 1))
+    columns = np.concatenate([np.kron(s[:, None], np.eye(3)[:, [i]]) for s in sources for i in range(3)], 1)
+    relieved = columns - M @ (rigid @ (rigid.T @ columns))
+    bends = np.abs(relieved).max(0) > 1e-6 * np.abs(columns).max(0)
+    if not bends.any():
+        return np.zeros((K.shape[0], 0))
+    found = vibration.Factor(K)(relieved[:, bends])
+    return found - rigid @ (rigid.T @ (M @ found))
 
 
 def _groups(coefficients: np.ndarray) -> np.ndarray:

@@ -175,7 +175,7 @@ class Solver:
         )
 
     def _start(self, velocity: Tensor | None) -> Float[Tensor, "r 3"]:
-        """Amplitudes of the initial velocity: the nearest in the basis, weighted by mass."""
+        """Amplitudes of the initial velocity."""
         body, p = self.model, len(self.position)
         if velocity is None:
             return torch.zeros(body.count, 3, dtype=torch.float64)
@@ -183,7 +183,8 @@ class Solver:
         if velocity.shape not in ((3,), (p, 3)):
             raise ValueError(f"velocity has shape {tuple(velocity.shape)}; take [3] or [{p}, 3]")
         v = velocity.cpu().double().expand(p, 3)
-        return torch.from_numpy(body.projection) @ v[torch.from_numpy(~body.conditions.held)]
+        free = v[torch.from_numpy(~body.conditions.held)]
+        return (torch.from_numpy(body.projection) @ free.reshape(-1)).reshape(body.count, 3)
 
     def _loads(self) -> Float[Tensor, "b r 3"]:
         """Force on every function: gravity, then each load at its full strength [N]."""
