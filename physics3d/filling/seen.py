@@ -6,8 +6,8 @@ is its pictures. A camera tells of a point x at depth z, with the pixel it falls
     outline    (1/2 - m) / |slope of m|, m the share of the pixel that is the body's: where m < 1/2, x is not the body's
                unless something static hides it
     depth      d - z where z < d + t: in front of what is seen there, or just behind it; d is where the pixel's ray
-               meets the Gaussian at which half the light is gone, if that is the body's, less FRONT deviations along the
-               ray: its centre may be as far beside the ray as it is broad
+               meets the Gaussian at which half the light is gone, if that is the body's, less FRONT deviations along
+               the ray: its centre may be as far beside the ray as it is broad
 
 Outlines exclude: the distance is the largest but for a tenth of the cameras, so that a few mistaken masks carve
 nothing. Depths are uncertain: the distance is their mean, cut off at the truncation t (Curless and Levoy 1996). The

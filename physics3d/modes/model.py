@@ -25,7 +25,15 @@ from physics3d.modes.dynamics import TOLERANCE, Spring, System
 from physics3d.modes.stress import Points
 from physics3d.world import World
 
-CELL = (1, 1.5, 2, 3, 4, 6, 8)  # spacing of the splines, in edges of a piece: the first with at most MOST_SPLINES of them
+CELL = (
+    1,
+    1.5,
+    2,
+    3,
+    4,
+    6,
+    8,
+)  # spacing of the splines, in edges of a piece: the first with at most MOST_SPLINES of them
 MOST_SPLINES = 1500
 PIN = 1e3  # stiffness of a pin, in that of a cube of the piece behind it
 MODES = 12  # of vibration, whose components are fields of the basis
