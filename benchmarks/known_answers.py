@@ -369,7 +369,7 @@ def simple_shear(cells: int, **changes) -> Answer:
     velocity = torch.zeros_like(position)
     velocity[:, 0] = position[:, 2] / seconds
     motion = simulate(world, position, volume, velocity=velocity, frames=3, frame_dt=seconds / 2)
-    free = frame.selection(Setting(position=position, mass=volume, lower=(0, 0, 0), upper=(1, 1, 1), dx=dx)) == 0
+    free = frame.selection(Setting(position=position, mass=volume, volume=volume, lower=(0, 0, 0), upper=(1, 1, 1), dx=dx)) == 0
     exact = torch.eye(3, dtype=torch.float64)
     exact[0, 2] = 1.0
     off = motion.deformation[-1, free].double() - exact

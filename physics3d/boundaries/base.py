@@ -1,9 +1,10 @@
-"""What a boundary condition is to the solver: numbers, and up to four Warp functions, each at its place in a substep.
+"""What a boundary condition is to the solver: numbers, and up to five Warp functions, each at its place in a substep.
 
     acceleration   added to selected particles before they are scattered           (forces from outside)
     touch          does a particle reach the boundary? `node` then acts only on the nodes of those that do
-    node           velocity of a grid node -> velocity of that node                 (walls, colliders, held regions)
-    steer          velocity and its gradient of selected particles after the gather  (motion imposed on the body itself)
+    node           velocity of a grid node -> velocity of that node                 (walls, colliders)
+    grip           how much of a selected particle is gripped now: it moves as imposed, whatever acts on it
+    steer          the velocity that is imposed there, and its gradient             (zero: it is held)
 
 The solver calls whatever is there, in the order of the list, and never asks which one it has. A boundary's numbers are
 of two kinds: `parameters` are constant during a rollout, differentiable, and travel in one vector; `signals` depend on
@@ -31,6 +32,7 @@ class Setting:
 
     position: Float[Tensor, "p 3"]  # rest positions [m], float64
     mass: Float[Tensor, " p"]  # [kg], float64
+    volume: Float[Tensor, " p"]  # [m^3], float64
     lower: Vector  # corner of the simulated region [m]
     upper: Vector
     dx: float  # [m]
@@ -54,7 +56,8 @@ class AbstractBoundary(abc.ABC):
         node(x: vec3, v: vec3, q: array[real], a: int, clock: array2d[real], row: int, b: int) -> vec3
         touch(x: vec3, radius: real, q, a, clock, row, b) -> bool
         acceleration(weight: real, x: vec3, q, a, clock, row, b) -> vec3
-        steer(weight: real, x: vec3, v: vec3, L: mat33, q, a, clock, row, b) -> (vec3, mat33)
+        grip(weight: real, q, a, clock, row, b) -> real, from 0 to 1
+        steer(x: vec3, q, a, clock, row, b) -> (vec3, mat33)
     where q[a + i] is its i-th parameter, clock[row, b + i] its i-th signal in this substep, clock[row, 0] is dt, x is
     in metres, weight what `selection` gave for the particle (never 0 in a call), and radius half the edge of the cube
     that the particle is at rest [m].
@@ -73,7 +76,8 @@ class AbstractBoundary(abc.ABC):
         return ()
 
     def selection(self, setting: Setting) -> Float[Tensor, " p"]:
-        """Weight per particle for `acceleration` and `steer`; 0 leaves the particle alone."""
+        """Weight per particle for `acceleration` and `grip`; 0 leaves the particle alone. Differentiable where it depends
+        on the place."""
         return torch.zeros(len(setting.position), dtype=torch.float64)
 
     def behind(self, setting: Setting) -> Float[Tensor, " p"]:
@@ -95,6 +99,9 @@ class AbstractBoundary(abc.ABC):
         return None
 
     def acceleration(self, real: type) -> wp.Function | None:
+        return None
+
+    def grip(self, real: type) -> wp.Function | None:
         return None
 
     def steer(self, real: type) -> wp.Function | None:

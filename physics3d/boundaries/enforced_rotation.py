@@ -15,9 +15,9 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
-from physics3d.boundaries import base
+from physics3d.boundaries import base, gripped
 from physics3d.checks import Direction, Duration, Length, Time
-from physics3d.warp_types import matrix, vector
+from physics3d.warp_types import vector
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,31 +54,28 @@ class EnforcedRotation(base.AbstractBoundary):
             return on, w, 0.0
         return on, math.sin(w * dt) / dt, 2 * math.sin(w * dt / 2) ** 2 / dt
 
+    def grip(self, real: type) -> wp.Function:
+        return gripped.while_on(real)
+
     def steer(self, real: type) -> wp.Function:
         return _steer(real)
 
 
 @functools.cache
 def _steer(real: type) -> wp.Function:
-    vec3, mat33 = vector(real), matrix(real)
+    vec3 = vector(real)
 
     @wp.func(name=f"enforced_rotation_{real.__name__}")
     def steer(
-        weight: real,
         x: vec3,
-        v: vec3,
-        L: mat33,
         q: wp.array(dtype=real),
         a: int,
         clock: wp.array2d(dtype=real),
         row: int,
         b: int,
     ):
-        speed, gradient = v, L
-        if clock[row, b] > real(0.0):
-            K = wp.skew(vec3(q[a + 3], q[a + 4], q[a + 5]))
-            gradient = clock[row, b + 1] * K + clock[row, b + 2] * (K * K)
-            speed = gradient * (x - vec3(q[a], q[a + 1], q[a + 2]))
-        return speed, gradient
+        K = wp.skew(vec3(q[a + 3], q[a + 4], q[a + 5]))
+        gradient = clock[row, b + 1] * K + clock[row, b + 2] * (K * K)
+        return gradient * (x - vec3(q[a], q[a + 1], q[a + 2])), gradient
 
     return steer

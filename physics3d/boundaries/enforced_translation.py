@@ -12,7 +12,7 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
-from physics3d.boundaries import base
+from physics3d.boundaries import base, gripped
 from physics3d.checks import Corners, Duration, Time
 from physics3d.warp_types import matrix, vector
 
@@ -40,6 +40,9 @@ class EnforcedTranslation(base.AbstractBoundary):
     def signals(self, t: float, dt: float) -> tuple[float]:
         return (float(self.start <= t < self.start + self.duration),)
 
+    def grip(self, real: type) -> wp.Function:
+        return gripped.while_on(real)
+
     def steer(self, real: type) -> wp.Function:
         return _steer(real)
 
@@ -50,19 +53,13 @@ def _steer(real: type) -> wp.Function:
 
     @wp.func(name=f"enforced_translation_{real.__name__}")
     def steer(
-        weight: real,
         x: vec3,
-        v: vec3,
-        L: mat33,
         q: wp.array(dtype=real),
         a: int,
         clock: wp.array2d(dtype=real),
         row: int,
         b: int,
     ):
-        speed, gradient = v, L
-        if clock[row, b] > real(0.0):
-            speed, gradient = vec3(q[a], q[a + 1], q[a + 2]), mat33()
-        return speed, gradient
+        return vec3(q[a], q[a + 1], q[a + 2]), mat33()
 
     return steer

@@ -1,6 +1,9 @@
 """Fixed region: nothing moves in this box, as if it were clamped (a stem in its pot, the held end of a bar).
 
-For good, or for start <= t < start + duration (held, then let go)."""
+For good, or for start <= t < start + duration (held, then let go). Matter that is in the box AT REST is gripped, and of a
+particle that its face cuts, a cube at rest, the part inside: the body is held where the face is written, and what moves
+is smooth in the place of the face. Nodes in the box with nothing of that matter have no velocity, so what comes later
+is stopped at the last of them."""
 
 import functools
 import math
@@ -11,14 +14,14 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
-from physics3d.boundaries import base
+from physics3d.boundaries import base, gripped
 from physics3d.checks import Corners, Lasting, Time
 from physics3d.warp_types import vector
 
 
 @dataclass(frozen=True, kw_only=True)
 class FixedRegion(base.AbstractBoundary):
-    """Nodes between the corners lower and upper [m] have no velocity."""
+    """Holds what is between the corners lower and upper [m]."""
 
     lower: base.Vector
     upper: base.Vector
@@ -35,9 +38,25 @@ class FixedRegion(base.AbstractBoundary):
     def signals(self, t: float, dt: float) -> tuple[float]:
         return (float(self.start <= t < self.start + self.duration),)
 
+    def selection(self, setting: base.Setting) -> Float[Tensor, " p"]:
+        """Share of each particle that is in the box."""
+        edge = setting.volume.to(setting.position)[:, None] ** (1 / 3)
+        lower, upper = setting.position.new_tensor(self.lower), setting.position.new_tensor(self.upper)
+        x = setting.position
+        inside = torch.minimum(x + edge / 2, upper) - torch.maximum(x - edge / 2, lower)
+        share = (inside / edge).clamp(0, 1).prod(1)
+        # what is inside but for rounding is inside
+        return torch.where(share > 1 - 1e-9, torch.ones_like(share), torch.where(share < 1e-9, 0.0 * share, share))
+
     def holds(self, setting: base.Setting) -> Float[Tensor, " p"]:
         inside = base.inside_box(setting.position, self.lower, self.upper)
         return inside if self.start <= 0 else torch.zeros_like(inside)
+
+    def grip(self, real: type) -> wp.Function:
+        return gripped.while_on(real)
+
+    def steer(self, real: type) -> wp.Function:
+        return gripped.still(real)
 
     def node(self, real: type) -> wp.Function:
         return _node(real)

@@ -13,9 +13,8 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
-from physics3d.boundaries import base
+from physics3d.boundaries import base, gripped
 from physics3d.checks import Corners, Count, Direction, Duration, Time
-from physics3d.warp_types import matrix, vector
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,29 +46,17 @@ class SequentialRelease(base.AbstractBoundary):
         """How many slices are free."""
         return (math.floor((t - self.start) / self.interval + 1e-9) + 1.0,)
 
+    def grip(self, real: type) -> wp.Function:
+        return _grip(real)
+
     def steer(self, real: type) -> wp.Function:
-        return _steer(real)
+        return gripped.still(real)
 
 
 @functools.cache
-def _steer(real: type) -> wp.Function:
-    vec3, mat33 = vector(real), matrix(real)
-
+def _grip(real: type) -> wp.Function:
     @wp.func(name=f"sequential_release_{real.__name__}")
-    def steer(
-        weight: real,
-        x: vec3,
-        v: vec3,
-        L: mat33,
-        q: wp.array(dtype=real),
-        a: int,
-        clock: wp.array2d(dtype=real),
-        row: int,
-        b: int,
-    ):
-        speed, gradient = v, L
-        if weight > clock[row, b] + real(0.5):
-            speed, gradient = vec3(), mat33()
-        return speed, gradient
+    def grip(weight: real, q: wp.array(dtype=real), a: int, clock: wp.array2d(dtype=real), row: int, b: int):
+        return wp.where(weight > clock[row, b] + real(0.5), real(1.0), real(0.0))
 
-    return steer
+    return grip

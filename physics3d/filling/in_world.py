@@ -28,6 +28,7 @@ def look_ahead(body: Body, world: World, excitation: tuple[AbstractBoundary, ...
     setting = Setting(
         position=body.position.double().cpu(),
         mass=world.density * body.volume.double().cpu(),
+        volume=body.volume.double().cpu(),
         lower=tuple(-v for v in everywhere),  # type: ignore[arg-type]
         upper=everywhere,
         dx=world.dx,

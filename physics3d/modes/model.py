@@ -125,7 +125,7 @@ def model(
     a boundary needs the grid."""
     x, V = position.detach().cpu().double(), volume.detach().cpu().double()
     corner = x.amin(0).tolist(), x.amax(0).tolist()
-    setting = Setting(position=x, mass=world.density * V, lower=corner[0], upper=corner[1], dx=world.dx)
+    setting = Setting(position=x, mass=world.density * V, volume=V, lower=corner[0], upper=corner[1], dx=world.dx)
     if matter is None:
         matter = of_particles(x, V)
     found = conditions(boundaries, setting, in_one_piece(matter))

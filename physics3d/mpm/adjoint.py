@@ -38,10 +38,16 @@ class Adjoint:
         self.offset: wp.array = arrays.zeros(arrays.n, vec3)
         self.rest: wp.array = arrays.zeros(arrays.n, vec3)
         self.q: list[wp.array] = [arrays.zeros(max(1, arrays.parameter_count), real) for _ in arrays.ranges]
+        self.selection: wp.array = arrays.zeros(arrays.constant["selection"].shape, real)  # [boundary, p]
+        self.mass: wp.array = arrays.zeros(arrays.n, real)  # of what is free, and below it volume
+        self.volume: wp.array = arrays.zeros(arrays.n, real)
         # on the nodes
         self.capacity: int = 0
         self.grid: wp.array = arrays.zeros(0, vector4(real))
         self.node_velocity: wp.array = arrays.zeros((arrays.workers, 0), vec3)
+        self.gripped: wp.array = arrays.zeros(1, real)
+        self.depth: wp.array = arrays.zeros(1, real)
+        self.imposed: wp.array = arrays.zeros(1, vec3)
         self.fours: wp.array | None = None  # node velocities as the fast gather adds to them
         self.momenta: wp.array | None = None  # [substep of a run, node] before the update
         self._launches: dict[tuple[int, int, int, int], Launches] = {}  # of worker w, from state j to i, adjoint set
@@ -49,7 +55,7 @@ class Adjoint:
 
     def clear(self) -> None:
         """Zero again."""
-        for array in (self.coefficients, self.offset, self.rest, *self.q):
+        for array in (self.coefficients, self.offset, self.rest, self.selection, self.mass, self.volume, *self.q):
             array.zero_()
         for state in self.states:
             state.flat.zero_()
@@ -76,8 +82,10 @@ class Adjoint:
                 arrays.set_row(w, s)
                 if w == 0:
                     self.states[1 - now].flat.zero_()
-                if "clear_pushed" in adjoint:
-                    adjoint["clear_pushed"].launch()
+                for name in ("clear_pushed", "clear_mass", "clear_volume"):
+                    if name in adjoint:
+                        adjoint[name].launch()
+                substeps.hold(launch)
                 if momenta is None:
                     substeps.scatter(launch)
                 elif "push" in launch:
@@ -97,15 +105,21 @@ class Adjoint:
                 first, count = nodes[w]
                 if count and "total" in adjoint:
                     launch_over(adjoint["total"], first, count)
-                if arrays.mirrored:
+                if arrays.coupled:
                     wait()
                     # the adjoint adds to nodes of other workers: the first one does them all
                     first, count = (0, arrays.node_count) if w == 0 else (0, 0)
                 if count:
                     launch_over(adjoint["clear_grid"], first, count)
+                    if arrays.grips:
+                        launch_over(adjoint["clear_gripped"], 0, arrays.grips * count)
+                        launch_over(adjoint["clear_depth"], first, count)
+                        launch_over(adjoint["clear_imposed"], first, count)
                     launch_over(adjoint["update"], first, count)
+                    if arrays.grips:
+                        launch_over(adjoint["face"], first, count)
                 wait()
-                for name in ("scatter", "push"):
+                for name in ("scatter", "push", "hold"):
                     if name in adjoint:
                         adjoint[name].launch()
 
@@ -129,12 +143,13 @@ class Adjoint:
         return 1 - side
 
     def gradients(self, first: State) -> tuple[torch.Tensor, ...]:
-        """Gradients of coefficients [k, p], q, initial velocity [p, 3], its gradient [p, 3, 3], and rest position
-        [p, 3], from the adjoint of the first state (copies)."""
+        """Gradients of coefficients [k, p], q, initial velocity [p, 3], its gradient [p, 3, 3], rest position [p, 3] and
+        selection [boundary, p], from the adjoint of the first state (copies)."""
         q = torch.stack([wp.to_torch(array) for array in self.q]).sum(0)[: self.arrays.parameter_count]
         place = wp.to_torch(self.rest) + wp.to_torch(self.offset) / self.arrays.dx
         coefficients = wp.to_torch(self.coefficients).clone()
-        return coefficients, q, first.v_gathered.clone(), first.L_gathered.clone(), place.double()
+        selection = wp.to_torch(self.selection)[: self.arrays.boundary_count].clone()
+        return coefficients, q, first.v_gathered.clone(), first.L_gathered.clone(), place.double(), selection
 
     def arguments(self, w: int, side: int) -> dict[str, dict[str, wp.array | None]]:
         """For the kernels of a substep whose adjoints are generated, the adjoint arrays of their arguments; the adjoint
@@ -144,12 +159,21 @@ class Adjoint:
         after = dict(u_next=b["u"], H_next=b["H"], memory_next=b["memory"], tau=b["tau"])
         return {
             "push": dict(**at, v=a["v"], v_pushed=self.v_pushed),
-            "update": dict(q=self.q[w], grid=self.grid, node_velocity=self.node_velocity[0]),
+            "hold": dict(
+                offset=self.offset, u=a["u"], selection=self.selection, mass=self.mass, volume=self.volume,
+                gripped=self.gripped, q=self.q[w],
+            ),
+            "face": dict(
+                q=self.q[w], grid=self.grid, gripped=self.gripped, depth=self.depth, imposed=self.imposed,
+            ),
+            "update": dict(
+                q=self.q[w], grid=self.grid, depth=self.depth, imposed=self.imposed, node_velocity=self.node_velocity[0],
+            ),
             "steer": dict(**at, v_gathered=b["v_gathered"], L_gathered=b["L_gathered"], v=b["v"], L=b["L"]),
             "advance": dict(
                 u=a["u"], v=b["v"], L=b["L"], H=a["H"], coefficients=self.coefficients, memory=a["memory"], **after
             ),
-        }
+        }  # fmt: skip
 
     def _launch(self, w: int, i: int, j: int, side: int) -> Launches:
         key = (w, i, j, side)
@@ -185,6 +209,8 @@ class Adjoint:
                 adjoint_v=a["v"] if self.v_pushed is None else self.v_pushed,
                 adjoint_L=a["L"],
                 adjoint_tau=a["tau"],
+                adjoint_mass=self.mass,
+                adjoint_volume=self.volume,
             ),
         )
         launches["gather"] = one(
@@ -203,6 +229,12 @@ class Adjoint:
         launches["clear_private"] = one(grids.clear(kind), 1, dict(first=0, values=private[w]))
         if self.v_pushed is not None:
             launches["clear_pushed"] = one(grids.clear(vec3), count, dict(first=first, values=self.v_pushed))
+        if arrays.grips:
+            for name in ("mass", "volume"):
+                own = dict(first=first, values=getattr(self, name))
+                launches[f"clear_{name}"] = one(grids.clear(real), count, own)
+            for name, kind in (("gripped", real), ("depth", real), ("imposed", vec3)):
+                launches[f"clear_{name}"] = one(grids.clear(kind), 1, dict(first=0, values=getattr(self, name)))
         launches["clear_grid"] = one(grids.clear(vec4), 1, dict(first=0, values=self.grid))
         return launches
 
@@ -215,6 +247,10 @@ class Adjoint:
         vec3, vec4 = vector(arrays.real), vector4(arrays.real)
         self.grid = arrays.zeros(self.capacity, vec4)
         self.node_velocity = arrays.zeros((arrays.workers, self.capacity), vec3)
+        if arrays.grips:
+            self.gripped = arrays.zeros(arrays.grips * self.capacity, arrays.real)
+            self.depth = arrays.zeros(self.capacity, arrays.real)
+            self.imposed = arrays.zeros(self.capacity, vec3)
         if arrays.fast:
             self.fours = arrays.zeros((arrays.workers, self.capacity), vec4)
             few = self.capacity < _KEEP_MOMENTA * arrays.n

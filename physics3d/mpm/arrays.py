@@ -51,14 +51,20 @@ class Arrays:
         self.dx: float = dx
         self.memory_rows: int = memory_rows
         self.steered: bool = bool(hooks.steer)
+        self.grips: int = len(hooks.grip)
         self.mirrored: bool = walls is not None
+        self.coupled: bool = self.mirrored or self.grips > 0  # nodes depend on each other
         self.parameter_count: int = len(q)
         self.row_count: int = len(coefficients)
+        self.boundary_count: int = len(selection)
         self.mass_floor: float = 1e-12 * float(mass.mean())  # [kg], of nodes
         vec3 = vector(self.real)
         self.constant: dict[str, Any] = {
-            "mass": wp.from_torch(mass),
-            "volume": wp.from_torch(volume),
+            "whole_mass": wp.from_torch(mass),
+            "whole_volume": wp.from_torch(volume),
+            # what is free of them: all, unless something grips
+            "mass": wp.from_torch(mass.clone()),
+            "volume": wp.from_torch(volume.clone()),
             "cell": wp.from_torch(cell, dtype=wp.vec3i),
             "rest": wp.from_torch(rest, dtype=vec3),
             "offset": wp.from_torch(offset, dtype=vec3),
@@ -92,6 +98,11 @@ class Arrays:
         self.grid: wp.array = self.zeros((self.workers, 0), vector4(self.real))  # momentum [kg m/s], mass [kg]
         self.node_velocity: wp.array = self.zeros(0, vec3)  # [m/s]
         self.touched: wp.array = self.zeros((1, 1), wp.int32)  # [hook, node] stamps
+        # distance from what is gripped [cells], the velocity imposed there [m/s], the node to follow: see `hold`
+        self.gripped: wp.array = self.zeros((self.workers, 1), self.real)  # [worker, grip x node] [kg]
+        self.depth: wp.array = self.zeros(1, self.real)
+        self.imposed: wp.array = self.zeros(1, vec3)
+        self.leader: wp.array = self.zeros(1, wp.int32)
         self.set_window((0, 0, 0), (1, 1, 1))
 
     def zeros(self, shape: int | tuple[int, ...], dtype: type) -> wp.array:
@@ -116,6 +127,11 @@ class Arrays:
             self.node_velocity = self.zeros(self.capacity, vector(self.real))
             if self._touch_count:
                 self.touched = self.zeros((self._touch_count, self.capacity), wp.int32)
+            if self.grips:
+                self.gripped = self.zeros((self.workers, self.grips * self.capacity), self.real)
+                self.depth = self.zeros(self.capacity, self.real)
+                self.imposed = self.zeros(self.capacity, vector(self.real))
+                self.leader = self.zeros(self.capacity, wp.int32)
 
     def set_clock(self, clock: np.ndarray) -> None:
         table = np.zeros(self.clock.shape)
@@ -152,4 +168,7 @@ class Arrays:
             "window": self.window,
             "touched": self.touched,
             "node_velocity": self.node_velocity,
+            "depth": self.depth,
+            "imposed": self.imposed,
+            "leader": self.leader,
         }

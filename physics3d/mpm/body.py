@@ -41,8 +41,9 @@ class Body:
         return survey(now, self.substeps.arrays.constant, modulus, setting.dx, low, high)
 
 
-def make_body(problem: Problem, coefficients: Tensor, q: Tensor, position: Tensor) -> Body:
-    """`coefficients` [k, p], `q` parameters of the boundaries, `position` [p, 3] at rest in float64, sorted by cell."""
+def make_body(problem: Problem, coefficients: Tensor, q: Tensor, position: Tensor, selection: Tensor) -> Body:
+    """`coefficients` [k, p], `q` parameters of the boundaries, `position` [p, 3] at rest in float64, `selection`
+    [boundary, p]; sorted by cell."""
     world, setting = problem.world, problem.setting
     kind: dict[str, Any] = {"device": problem.device, "dtype": world.dtype}
     origin = setting.position.new_tensor(setting.lower)
@@ -53,7 +54,6 @@ def make_body(problem: Problem, coefficients: Tensor, q: Tensor, position: Tenso
     volume = mass / world.density
     real = wp.float32 if world.dtype == torch.float32 else wp.float64
     hooks = hooks_of(problem.boundaries, problem.widths, real)
-    selection = [boundary.selection(setting) for boundary in problem.boundaries]
     threads = problem.threads
     if threads is None:
         threads = min(os.cpu_count() or 1, 8, 1 + len(position) // 4000)
@@ -68,7 +68,7 @@ def make_body(problem: Problem, coefficients: Tensor, q: Tensor, position: Tenso
         offset=(cells - cell).to(**kind),
         coefficients=coefficients.contiguous(),
         q=q,
-        selection=torch.stack(selection)[:, problem.order.cpu()].to(**kind) if selection else torch.zeros(0, 0),
+        selection=selection,
         hooks=hooks,
         walls=mirror_nodes(problem.boundaries, setting),
         memory_rows=world.material.memory_rows,

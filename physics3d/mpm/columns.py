@@ -249,14 +249,14 @@ def spread_adjoint(real, fast: bool) -> wp.Function:
         ay = vec3(A[0, 1], A[1, 1], A[2, 1])
         az = vec3(A[0, 2], A[1, 2], A[2, 2])
         zero, one = real(0.0), real(1.0)
-        mean, bx, by, bz, slope = vec3(), vec3(), vec3(), vec3(), vec3()
+        mean, bx, by, bz, slope, mass = vec3(), vec3(), vec3(), vec3(), vec3(), zero
         qi = q
         rx = -f[0]
         for i in range(3):
             qij = qi
             ry = -f[1]
             for j in range(3):
-                s, sz = vec3(), vec3()  # along a column: sum w P, sum w r_z P,
+                s, sz, sm = vec3(), vec3(), zero  # along a column: sum w P, sum w r_z P, sum w M,
                 e, ez = zero, zero  # sum w [P . q + m M], sum w' [P . q + m M]
                 qijk = qij
                 rz = -f[2]
@@ -267,12 +267,14 @@ def spread_adjoint(real, fast: bool) -> wp.Function:
                     a = w[2, k] * P
                     s = s + a
                     sz = sz + rz * a
+                    sm = sm + w[2, k] * value[3]
                     e = e + w[2, k] * power
                     ez = ez + g[2, k] * power
                     qijk = qijk + az
                     rz = rz + one
                 wij = w[0, i] * w[1, j]
                 mean = mean + wij * s
+                mass = mass + wij * sm
                 bx = bx + (wij * rx) * s
                 by = by + (wij * ry) * s
                 bz = bz + wij * sz
@@ -282,7 +284,7 @@ def spread_adjoint(real, fast: bool) -> wp.Function:
             qi = qi + ax
             rx = rx + one
         return mat54(
-            mean[0], mean[1], mean[2], zero, bx[0], bx[1], bx[2], zero, by[0], by[1], by[2], zero,
+            mean[0], mean[1], mean[2], mass, bx[0], bx[1], bx[2], zero, by[0], by[1], by[2], zero,
             bz[0], bz[1], bz[2], zero, slope[0], slope[1], slope[2], zero,
         )  # fmt: skip
 

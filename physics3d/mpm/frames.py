@@ -53,10 +53,12 @@ class TooFast(Exception):
 class Frames:
     """The forward loop over frames and the reverse loop over runs."""
 
-    def __init__(self, problem: Problem, coefficients: Tensor, q: Tensor, position: Tensor, *, keep: bool):
+    def __init__(
+        self, problem: Problem, coefficients: Tensor, q: Tensor, position: Tensor, selection: Tensor, *, keep: bool
+    ):
         """Arguments as of `make_body`; `keep` what a gradient needs."""
         self.problem = problem
-        self.body = make_body(problem, coefficients, q, position)
+        self.body = make_body(problem, coefficients, q, position, selection)
         self.substeps = self.body.substeps
         self.arrays = self.substeps.arrays
         self.implicit: ImplicitSubsteps | None = None
@@ -100,7 +102,7 @@ class Frames:
         return u, deformation
 
     def backward(self, adjoint_u: Tensor, adjoint_F: Tensor) -> tuple[Tensor, ...]:
-        """Gradients of coefficients, q, velocity, its gradient, and position."""
+        """Gradients of coefficients, q, velocity, its gradient, position, and selection."""
         arrays, substeps = self.arrays, self.substeps
         if self.adjoint is None:
             self.adjoint = Adjoint(substeps)
@@ -192,7 +194,7 @@ class Frames:
                 f"frame {frame}: implicit, for the explicit scheme would need {explicit} substeps a frame"
             )
         self.now_implicit = True
-        self.implicit = ImplicitSubsteps(self.substeps, bounded=bool(self.body.hooks.node))
+        self.implicit = ImplicitSubsteps(self.substeps, bounded=bool(self.body.hooks.node or self.body.hooks.grip))
 
     def _count(self, frame: int) -> int:
         """Substeps of the coming frame. Raises ValueError as `substeps_of_frame` does."""

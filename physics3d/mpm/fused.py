@@ -16,14 +16,17 @@ from physics3d.warp_types import matrix, vector, vector4
 
 
 @cache
-def particle_pass(real, material: wp.Function, pushes: tuple[Hook, ...], steers: tuple[Hook, ...]) -> wp.Kernel:
+def particle_pass(
+    real, material: wp.Function, pushes: tuple[Hook, ...], grips: tuple[Hook, ...], steers: tuple[Hook, ...]
+) -> wp.Kernel:
     """Kernel: from the node velocities of substep `row` to the momentum of the next one."""
     vec3, vec4, mat33 = vector(real), vector4(real), matrix(real)
     first_node, local, weights, _ = stencil(real)
     gathered, spread = columns.gathered(real, fast=True), columns.spread(real, fast=True)
     push, push_a, push_b, push_row = columns_of(pushes)
-    steer, steer_a, steer_b, steer_row = columns_of(steers)
-    push_count, steer_count = len(pushes), len(steers)
+    grip, grip_a, grip_b, grip_row = columns_of(grips)
+    steer = columns_of(steers)[0]
+    push_count, grip_count = len(pushes), len(grips)
 
     @wp.kernel(module="unique", enable_backward=False)
     def particle_pass_kernel(
@@ -38,8 +41,8 @@ def particle_pass(real, material: wp.Function, pushes: tuple[Hook, ...], steers:
         selection: wp.array2d(dtype=real),  # [boundary, p]
         rest: wp.array(dtype=vec3),  # [p] [m]
         q: wp.array(dtype=real),  # [k] parameters of the boundaries
-        mass: wp.array(dtype=real),  # [p] [kg]
-        volume: wp.array(dtype=real),  # [p] at rest [m^3]
+        whole_mass: wp.array(dtype=real),  # [p] [kg]
+        whole_volume: wp.array(dtype=real),  # [p] at rest [m^3]
         cell: wp.array(dtype=wp.vec3i),  # [p] of the rest position
         offset: wp.array(dtype=vec3),  # [p] of the rest position in its cell [cells]
         coefficients: wp.array2d(dtype=real),  # [k, p] of the material
@@ -74,17 +77,18 @@ def particle_pass(real, material: wp.Function, pushes: tuple[Hook, ...], steers:
             L = (real(4.0) / dx) * mat33(
                 S[1, 0], S[2, 0], S[3, 0], S[1, 1], S[2, 1], S[3, 1], S[1, 2], S[2, 2], S[3, 2]
             )
-            if wp.static(steer_count > 0):
+            if wp.static(grip_count > 0):
                 if keep == 1:
                     v_gathered[p] = v
                     L_gathered[p] = L
                 x = rest[p] + place
-                for i in range(wp.static(steer_count)):
-                    weight = selection[wp.static(steer_row[i]), p]
+                for i in range(wp.static(grip_count)):
+                    weight = selection[wp.static(grip_row[i]), p]
                     if weight != real(0.0):
-                        v, L = wp.static(steer[i])(
-                            weight, x, v, L, q, wp.static(steer_a[i]), clock, r, wp.static(steer_b[i])
-                        )
+                        if wp.static(grip[i])(weight, q, wp.static(grip_a[i]), clock, r, wp.static(grip_b[i])) >= real(
+                            1.0
+                        ):
+                            v, L = wp.static(steer[i])(x, q, wp.static(grip_a[i]), clock, r, wp.static(grip_b[i]))
             place = place + dt * v
             deformation, stress = material(p, dt, L, H[p], coefficients, memory, memory_next)
             u_next[p] = place
@@ -110,8 +114,16 @@ def particle_pass(real, material: wp.Function, pushes: tuple[Hook, ...], steers:
                 node = first_node(cell[p], d, window)
                 if node >= 0:
                     f = local(d)
-                    m = mass[p]
-                    A = (m * dx) * L - (real(4.0) * dt * volume[p] / dx) * stress
+                    left = real(1.0)
+                    for i in range(wp.static(grip_count)):
+                        weight = selection[wp.static(grip_row[i]), p]
+                        if weight != real(0.0):
+                            left = left - wp.min(
+                                left,
+                                wp.static(grip[i])(weight, q, wp.static(grip_a[i]), clock, r, wp.static(grip_b[i])),
+                            )
+                    m = left * whole_mass[p]
+                    A = (m * dx) * L - (real(4.0) * dt * left * whole_volume[p] / dx) * stress
                     spread(grid, node, ny, nz, weights(f), m * v - A * f, m, A)
                 else:
                     wp.atomic_add(lost, 0, 1)

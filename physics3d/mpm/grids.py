@@ -10,6 +10,7 @@ from physics3d.warp_types import vector, vector4
 @cache
 def clear(dtype) -> wp.Kernel:
     """Kernel: set a range of an array to zero."""
+    zero = dtype(0.0)
 
     @wp.kernel(module="unique", enable_backward=False)
     def clear_kernel(
@@ -18,7 +19,7 @@ def clear(dtype) -> wp.Kernel:
         # out
         values: wp.array(dtype=dtype),  # [node]
     ):
-        values[wp.tid() + first] = dtype()
+        values[wp.tid() + first] = wp.static(zero)
 
     return clear_kernel
 

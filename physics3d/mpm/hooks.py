@@ -2,8 +2,9 @@
 
     push    added to selected particles before they are scattered           (forces from outside)
     touch   does a particle reach the boundary? its `node` then acts only on the nodes of those that do
-    node    velocity of a grid node -> velocity of that node                 (walls, colliders, held regions)
-    steer   velocity and its gradient of selected particles after the gather (motion imposed on the body itself)
+    node    velocity of a grid node -> velocity of that node                 (walls, colliders)
+    grip    how much of a selected particle is gripped now, and has no part in the dynamics (`hold`)
+    steer   the velocity and its gradient imposed on what is gripped
 
 A kernel is made for the hooks of a scene, in the order of its boundaries; scenes with equal hooks share it. Only the
 body of a kernel may call them: Warp tells kernels apart by their own `wp.static` values, not by those of functions in
@@ -37,7 +38,8 @@ class Hooks:
     push: tuple[Hook, ...] = ()
     touch: tuple[Hook, ...] = ()
     node: tuple[Hook, ...] = ()
-    steer: tuple[Hook, ...] = ()
+    grip: tuple[Hook, ...] = ()
+    steer: tuple[Hook, ...] = ()  # one for each grip
     signals: int = 0  # of all boundaries together
 
 
@@ -46,6 +48,7 @@ def hooks_of(boundaries: Sequence[AbstractBoundary], widths: Sequence[int], real
     push: list[Hook] = []
     touch: list[Hook] = []
     node: list[Hook] = []
+    grip: list[Hook] = []
     steer: list[Hook] = []
     parameter, signal = 0, FIRST_SIGNAL
     for row, (boundary, width) in enumerate(zip(boundaries, widths, strict=True)):
@@ -53,13 +56,19 @@ def hooks_of(boundaries: Sequence[AbstractBoundary], widths: Sequence[int], real
             (push, boundary.acceleration(real)),
             (touch, boundary.touch(real)),
             (node, boundary.node(real)),
+            (grip, boundary.grip(real)),
             (steer, boundary.steer(real)),
         ):
             if function is not None:
                 place.append(Hook(function, parameter, signal, row))
         parameter, signal = parameter + width, signal + len(boundary.signals(0.0, 0.0))
     return Hooks(
-        push=tuple(push), touch=tuple(touch), node=tuple(node), steer=tuple(steer), signals=signal - FIRST_SIGNAL
+        push=tuple(push),
+        touch=tuple(touch),
+        node=tuple(node),
+        grip=tuple(grip),
+        steer=tuple(steer),
+        signals=signal - FIRST_SIGNAL,
     )
 
 

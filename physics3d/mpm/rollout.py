@@ -5,6 +5,8 @@
 `limits` says how long a substep is and which scheme is taken, `frames` goes from frame to frame and back.
 """
 
+import dataclasses
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -46,8 +48,11 @@ def rollout(
     if velocity is None:
         velocity = torch.zeros(3)
     lower, upper = region(world, position, velocity, frame_dt * (frames - 1))
-    mass = world.density * volume.detach().double().cpu()
-    setting = Setting(position=position.detach().double().cpu(), mass=mass, lower=lower, upper=upper, dx=world.dx)
+    rest_volume = volume.detach().double().cpu()
+    mass = world.density * rest_volume
+    setting = Setting(
+        position=position.detach().double().cpu(), mass=mass, volume=rest_volume, lower=lower, upper=upper, dx=world.dx
+    )
 
     if velocity.ndim == 1:
         gradient = torch.zeros(n, 3, 3)
@@ -64,6 +69,9 @@ def rollout(
     coefficients = world.material.coefficients({name: value.double().to(device) for name, value in parameters.items()})
     coefficients = place(coefficients.expand(len(coefficients), n)[:, order])
     q = [boundary.parameters(setting).to(torch.float64) for boundary in boundaries]
+    # how much of a particle a boundary selects may depend on where it is
+    there = dataclasses.replace(setting, position=position.double().cpu())
+    selection = [boundary.selection(there) for boundary in boundaries]
     problem = Problem(
         world=world,
         setting=setting,
@@ -82,6 +90,7 @@ def rollout(
         place(velocity.to(device).expand(n, 3)[order]),
         place(gradient.to(device)[order]),
         position.to(device=device, dtype=torch.float64)[order],
+        place(torch.stack(selection))[:, order] if selection else torch.zeros((0, n), dtype=dtype, device=device),
         problem,
     )
     rest = position.to(device=device, dtype=torch.float64)
@@ -97,15 +106,15 @@ def rollout(
 
 
 class _Rollout(torch.autograd.Function):
-    """(coefficients [k, p], q, velocity [p, 3], its gradient [p, 3, 3], position [p, 3]) -> displacement [t, p, 3],
-    deformation [t, p, 3, 3], and the frames as they were done."""
+    """(coefficients [k, p], q, velocity [p, 3], its gradient [p, 3, 3], position [p, 3], selection [boundary, p]) ->
+    displacement [t, p, 3], deformation [t, p, 3, 3], and the frames as they were done."""
 
     @staticmethod
-    def forward(ctx, coefficients, q, velocity, gradient, position, problem: Problem):
+    def forward(ctx, coefficients, q, velocity, gradient, position, selection, problem: Problem):
         start_warp()
-        inputs = (coefficients, q, velocity, gradient, position)
-        coefficients, q, velocity, gradient, position = (value.detach() for value in inputs)
-        ctx.frames = Frames(problem, coefficients, q, position, keep=any(ctx.needs_input_grad))
+        inputs = (coefficients, q, velocity, gradient, position, selection)
+        coefficients, q, velocity, gradient, position, selection = (value.detach() for value in inputs)
+        ctx.frames = Frames(problem, coefficients, q, position, selection.contiguous(), keep=any(ctx.needs_input_grad))
         u, deformation = ctx.frames.forward(velocity, gradient)
         return u, deformation, ctx.frames
 

@@ -1,4 +1,4 @@
-"""Motion imposed on the body itself: selected particles get a velocity and its gradient from a boundary."""
+"""Motion imposed on the body itself: particles gripped as a whole get a velocity and its gradient from a boundary."""
 
 from functools import cache
 
@@ -9,11 +9,12 @@ from physics3d.warp_types import matrix, vector
 
 
 @cache
-def steer(real, hooks: tuple[Hook, ...]) -> wp.Kernel:
+def steer(real, grips: tuple[Hook, ...], steers: tuple[Hook, ...]) -> wp.Kernel:
     """Kernel: velocities and their gradients as the material sees them, from the gathered ones."""
     vec3, mat33 = vector(real), matrix(real)
-    count = len(hooks)
-    functions, a, b, rows = columns_of(hooks)
+    count = len(grips)
+    grip, a, b, rows = columns_of(grips)
+    functions = columns_of(steers)[0]
 
     @wp.kernel(module="unique")
     def steer_kernel(
@@ -39,9 +40,8 @@ def steer(real, hooks: tuple[Hook, ...]) -> wp.Kernel:
         for i in range(wp.static(count)):
             weight = selection[wp.static(rows[i]), p]
             if weight != real(0.0):
-                speed, gradient = wp.static(functions[i])(
-                    weight, x, speed, gradient, q, wp.static(a[i]), clock, r, wp.static(b[i])
-                )
+                if wp.static(grip[i])(weight, q, wp.static(a[i]), clock, r, wp.static(b[i])) >= real(1.0):
+                    speed, gradient = wp.static(functions[i])(x, q, wp.static(a[i]), clock, r, wp.static(b[i]))
         v[p] = speed
         L[p] = gradient
 

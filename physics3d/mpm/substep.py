@@ -1,11 +1,13 @@
 """Substeps of MLS-MPM, symplectic Euler, one after another between numbered states.
 
+    hold     what is gripped of a particle has no part in the rest   (only if a boundary grips some)
     push     v_p += dt a_p                                        forces from outside (only if a boundary has some)
     scatter  particles -> momentum and mass of nodes
     mark     the nodes of particles that touch a boundary         (only if a boundary acts on those alone)
+    face     how far nodes are from what is gripped, then lead: which node they follow       (likewise)
     update   v_i = e^(-c dt) (p_i/m_i + dt g), then the boundaries
     gather   nodes -> v_p, L_p
-    steer    imposed motion of particles                          (only if a boundary has some)
+    steer    imposed motion of particles                          (only if a boundary grips some)
     advance  u_p += dt v_p; the material turns (L_p, H_p) into the next H_p and the stress for the next scatter
 
 Each is a kernel in a file of its name (scatter and gather are in `transfer`). Every array of a state is written once
@@ -28,6 +30,7 @@ from physics3d.mpm import grids, transfer
 from physics3d.mpm.advance import advance
 from physics3d.mpm.arrays import Arrays
 from physics3d.mpm.fused import particle_pass
+from physics3d.mpm.hold import face, hold, lead
 from physics3d.mpm.hooks import Hooks
 from physics3d.mpm.launches import Arguments, launch_over, record
 from physics3d.mpm.mark import mark
@@ -48,18 +51,21 @@ class Substeps:
         real, fast = arrays.real, arrays.fast
         self.kernels: dict[str, wp.Kernel] = {
             "scatter": transfer.scatter(real, fast),
-            "update": update(real, hooks.node, hooks.touch, arrays.mirrored),
+            "update": update(real, hooks.node, hooks.touch, hooks.grip, arrays.mirrored),
             "gather": transfer.gather(real, fast),
             "advance": advance(real, material),
         }
         if fast:
-            self.kernels["pass"] = particle_pass(real, material, hooks.push, hooks.steer)
+            self.kernels["pass"] = particle_pass(real, material, hooks.push, hooks.grip, hooks.steer)
         if hooks.touch:
             self.kernels["mark"] = mark(real, hooks.touch)
         if hooks.push:
             self.kernels["push"] = push(real, hooks.push)
-        if hooks.steer:
-            self.kernels["steer"] = steer(real, hooks.steer)
+        if hooks.grip:
+            self.kernels["hold"] = hold(real, hooks.grip)
+            self.kernels["face"] = face(real, hooks.grip, hooks.steer)
+            self.kernels["lead"] = lead(real)
+            self.kernels["steer"] = steer(real, hooks.grip, hooks.steer)
         self._launches: dict[tuple[int, int, int], Launches] = {}  # of worker w, from state i to state j
         self._capacity: int = arrays.capacity  # of the grid that they are for
 
@@ -80,6 +86,7 @@ class Substeps:
         def plain(w: int, wait: Wait) -> None:
             for s, launch in enumerate(launches[w]):
                 arrays.set_row(w, s)
+                self.hold(launch)
                 self.scatter(launch)
                 self.mark(w, launch)
                 wait()
@@ -92,9 +99,12 @@ class Substeps:
         def fast(w: int, wait: Wait) -> None:
             last = len(work) - 1
             arrays.set_row(w, 0)
+            self.hold(launches[w][0])
             self.scatter(launches[w][0])
             for s, launch in enumerate(launches[w]):
                 arrays.set_row(w, s)
+                if s:
+                    self.hold(launch)
                 self.mark(w, launch)
                 wait()
                 self.update(launch, *nodes[w], wait, None if momenta is None else momenta[s])
@@ -131,6 +141,12 @@ class Substeps:
         launch_over(launch["clear"], 0, self.arrays.node_count)
         launch["scatter"].launch()
 
+    def hold(self, launch: Launches) -> None:
+        """What is gripped of the particles of a worker, before they are scattered."""
+        if "hold" in launch:
+            launch_over(launch["clear_gripped"], 0, self.arrays.grips * self.arrays.node_count)
+            launch["hold"].launch()
+
     def mark(self, w: int, launch: Launches) -> None:
         """Stamp what the particles touch at the start of the substep; after all have read the last stamps."""
         if "mark" in launch:
@@ -158,7 +174,17 @@ class Substeps:
         self._update(launch, first, count, wait)
 
     def _update(self, launch: Launches, first: int, count: int, wait: Wait) -> None:
-        if self.arrays.mirrored:
+        grips = self.arrays.grips
+        if grips and self.arrays.workers > 1:
+            if count:
+                launch_over(launch["total_gripped"], grips * first, grips * count)
+            wait()
+        for name in ("face", "lead"):
+            if name in launch:
+                if count:
+                    launch_over(launch[name], first, count)
+                wait()
+        if self.arrays.coupled:
             wait()  # nodes read those of other workers
         if count:
             launch_over(launch["update"], first, count)
@@ -185,6 +211,9 @@ class Substeps:
         launches = {name: one(kernel, count, arguments[name]) for name, kernel in self.kernels.items()}
         launches["clear"] = one(grids.clear(vec4), 1, dict(first=0, values=arrays.grid[w]))
         launches["total"] = one(grids.total(vec4), 1, dict(first=0, grids=arrays.grid))
+        if arrays.grips:
+            launches["clear_gripped"] = one(grids.clear(arrays.real), 1, dict(first=0, values=arrays.gripped[w]))
+            launches["total_gripped"] = one(grids.total(arrays.real), 1, dict(first=0, grids=arrays.gripped))
         return launches
 
     def arguments(self, w: int, i: int, j: int) -> dict[str, dict[str, object]]:
@@ -201,7 +230,10 @@ class Substeps:
             "push": dict(first=first, u=a["u"], v=a["v"], v_pushed=arrays.v_pushed),
             "mark": dict(first=first, u=a["u"]),
             "scatter": dict(first=first, u=a["u"], v=v, L=a["L"], tau=a["tau"], **onto),
-            "update": dict(first=0, grid=arrays.grid[0]),
+            "hold": dict(first=first, u=a["u"], gripped=arrays.gripped[w]),
+            "face": dict(first=0, gripped=arrays.gripped[0], grid=arrays.grid[0]),
+            "lead": dict(first=0, grid=arrays.grid[0]),
+            "update": dict(first=0, gripped=arrays.gripped[0], grid=arrays.grid[0]),
             "gather": dict(first=first, u=a["u"], v=b["v_gathered"], L=b["L_gathered"]),
             "steer": dict(first=first, u=a["u"], **gathered, v=b["v"], L=b["L"]),
             "advance": dict(

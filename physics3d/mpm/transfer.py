@@ -109,7 +109,8 @@ def gather(real, fast: bool = False) -> wp.Kernel:
 def scatter_adjoint(real, fast: bool = False) -> wp.Kernel:
     """Kernel: adjoint of `scatter`. With the adjoint (P, M) of a node's momentum and mass and r = x_i - x_p in cells,
 
-    adj v = m sum w P,   adj A = sum w P r^T,   adj x = sum grad w [ P . (m v + A r) + m M ] - A^T sum w P
+    adj v = m sum w P,   adj A = sum w P r^T,   adj x = sum grad w [ P . (m v + A r) + m M ] - A^T sum w P,
+    adj m = sum w (P . v + M) + L : sum w P r^T,   adj V = -(4 dt/dx^2) tau : sum w P r^T
     """
     vec3, vec4, mat33 = vector(real), vector4(real), matrix(real)
     first_node, local, weights, slopes = stencil(real)
@@ -138,6 +139,8 @@ def scatter_adjoint(real, fast: bool = False) -> wp.Kernel:
         adjoint_v: wp.array(dtype=vec3),  # [p]
         adjoint_L: wp.array(dtype=mat33),  # [p]
         adjoint_tau: wp.array(dtype=mat33),  # [p]
+        adjoint_mass: wp.array(dtype=real),  # [p]
+        adjoint_volume: wp.array(dtype=real),  # [p]
     ):
         p = wp.tid() + first
         dt = clock[row[0], 0]
@@ -159,6 +162,8 @@ def scatter_adjoint(real, fast: bool = False) -> wp.Kernel:
             adjoint_v[p] = adjoint_v[p] + m * mean
             adjoint_L[p] = adjoint_L[p] + (m * dx) * B
             adjoint_tau[p] = adjoint_tau[p] - stress * B
+            adjoint_mass[p] = adjoint_mass[p] + wp.dot(mean, v[p]) + S[0, 3] + dx * wp.ddot(L[p], B)
+            adjoint_volume[p] = adjoint_volume[p] - (real(4.0) * dt / dx) * wp.ddot(tau[p], B)
 
     return scatter_adjoint_kernel
 

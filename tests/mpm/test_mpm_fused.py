@@ -26,7 +26,7 @@ def substeps(material, *, fast: bool, moved: bool = False, threads: int = 1) -> 
     position, volume = block((3, 3, 3), DX)
     n = len(position)
     mass = 1000 * volume
-    setting = Setting(position=position, mass=mass, lower=(0.0, 0.0, 0.0), upper=(0.3, 0.3, 0.3), dx=DX)
+    setting = Setting(position=position, mass=mass, volume=volume, lower=(0.0, 0.0, 0.0), upper=(0.3, 0.3, 0.3), dx=DX)
     push = Impulse(force=(30.0, 5.0, -4.0), centre=(0.2, 0.2, 0.2), radius=0.12, start=0.0, duration=1.0)
     turn = EnforcedRotation(
         point=(0.15, 0.15, 0.05), axis=(0.0, 0.1, 1.0), radius=0.12, half_height=0.06, angular_velocity=5.0,

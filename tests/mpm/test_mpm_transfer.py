@@ -57,7 +57,7 @@ def window():
 
 
 def scatter(p, adjoint=None, fast=False):
-    """grid [node, 4], lost; or with the adjoint of the grid: adjoints of u, v, L, tau."""
+    """grid [node, 4], lost; or with the adjoint of the grid: adjoints of u, v, L, tau, mass, volume."""
     start_warp()
     real = wp.float64 if p["u"].dtype == torch.float64 else wp.float32
     vec3, vec4, mat33 = vector(real), vector4(real), matrix(real)
@@ -69,7 +69,7 @@ def scatter(p, adjoint=None, fast=False):
     if adjoint is None:
         wp.launch(transfer.scatter(real, fast), N, inputs=inputs, outputs=[grid, lost], device="cpu")
         return wp.to_torch(grid), int(lost.numpy()[0])
-    offset, *found = [wp.zeros_like(value) for value in inputs[-5:]]
+    offset, *found = [wp.zeros_like(value) for value in (*inputs[-5:], *inputs[5:7])]
     inputs.append(array(adjoint, vec4))
     wp.launch(transfer.scatter_adjoint(real, fast), N, inputs=inputs, outputs=[offset, *found], device="cpu")
     torch.testing.assert_close(wp.to_torch(offset), wp.to_torch(found[0]) * DX)  # x in cells is offset + u/dx
@@ -103,7 +103,8 @@ def test_scatter_agrees_with_its_dense_twin_forwards_and_backwards(fast):
     grid, lost = scatter(p, fast=fast)
     assert lost == 0
     torch.testing.assert_close(grid, scatter_dense(p), atol=1e-11, rtol=1e-11)
-    leaves = [p[name].requires_grad_() for name in ("u", "v", "L", "tau")]
+    p["volume"] = p["volume"].clone()
+    leaves = [p[name].requires_grad_() for name in ("u", "v", "L", "tau", "mass", "volume")]
     adjoint = torch.randn(grid.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     expected = torch.autograd.grad((scatter_dense(p) * adjoint).sum(), leaves)
     detached = {name: value.detach() for name, value in p.items()}

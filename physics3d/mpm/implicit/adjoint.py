@@ -48,15 +48,18 @@ def reverse(
     tangent = Tangent(system, symmetric=False)
     constraints = Constraints(system, bounded=bounded)
     from_nodes[0] = _solve(system, tangent, constraints, wanted)
-    wp.to_torch(adjoint.grid).zero_()
+    for array in (adjoint.grid, adjoint.gripped, adjoint.depth, adjoint.imposed, adjoint.mass, adjoint.volume):
+        array.zero_()
     launches.on_nodes("update_back")
+    if launches.arrays.grips:
+        launches.on_nodes("face_back")
     # the forces on the nodes, and through them stress, material, velocity gradient and places
     for array in launches.own.values():
         array.zero_()
     launches.on_particles("force_back", "stress_back", "advance_again", "steer_again")
     if not launches.arrays.steered:
         wp.to_torch(launches.own["L_gathered"]).copy_(wp.to_torch(launches.own["L"]))
-    launches.on_particles("gather_again", "scatter_back", "push_back")
+    launches.on_particles("gather_again", "scatter_back", "push_back", "hold_back")
     return 1 - side
 
 

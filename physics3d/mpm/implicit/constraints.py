@@ -1,6 +1,6 @@
 """P = dB/du: what the boundaries make of a change of node velocities.
 
-Each node has a 3 x 3 block, unless walls mirror: then nodes depend on each other, and P is applied by the adjoint of
+Each node has a 3 x 3 block, unless walls mirror or something grips: then nodes depend on each other, and P is applied by the adjoint of
 the boundaries or by differences. Where P is a projector (sticky, slip, separate) the unknowns move in its range.
 """
 
@@ -20,7 +20,7 @@ class Constraints:
         self.P: Tensor | None = None  # [node, 3, 3]
         self.projectors: bool = True
         momentum = system.momentum
-        if system.mirrored:
+        if system.coupled:
             x = torch.rand((2, *momentum.shape), dtype=momentum.dtype, device=momentum.device) - 0.5
             images = [self.derivative(y) for y in x]
             off = abs(dot(system.mass * x[0], images[1]) - dot(system.mass * x[1], images[0]))
@@ -38,7 +38,7 @@ class Constraints:
     def derivative(self, x: Tensor, *, transposed: bool = False) -> Tensor:
         """P x or P^T x."""
         system = self.system
-        if system.mirrored:
+        if system.coupled:
             if transposed:
                 return system.mass * self._pull(x)
             # P/M is symmetric, unless something slides with friction

@@ -33,6 +33,7 @@ class StepLaunches:
         self.no_vector: wp.array = zeros(n, vec3)
         self.no_matrix: wp.array = zeros(n, mat33)
         self.no_adjoint: wp.array = zeros(n, mat33)  # of arguments that are multiplied by zero
+        self.no_number: wp.array = zeros(n, real)  # likewise
         self.T: wp.array = zeros(n, mat33)  # [Pa]
         self.E: wp.array = zeros(n, mat33)  # adjoint of T
         self.own: dict[str, wp.array] = {name: zeros(n, mat33) for name in ("T", "tau", "L", "L_gathered")}  # adjoints
@@ -83,6 +84,15 @@ class StepLaunches:
         assert launch is not None
         launch_over(launch, 0, self.arrays.node_count)
 
+    def grip(self) -> None:
+        """What is gripped of the particles, as mass of the nodes."""
+        arrays = self.arrays
+        if arrays.grips:
+            gripped = wp.to_torch(arrays.gripped)
+            gripped.zero_()
+            self.on_particles("hold")
+            total(gripped)
+
     def _launch(self, name: str, w: int) -> wp.Launch | None:
         key = (name, w, *self.pair, self.side)
         if key not in self._launches:
@@ -105,7 +115,7 @@ class StepLaunches:
         update = kernels["update"], arguments["update"]
         calls: dict[str, Call | None] = {
             name: (kernels[name], arguments[name], None) if name in kernels else None
-            for name in ("push", "mark", "gather", "steer", "advance")
+            for name in ("push", "hold", "face", "lead", "mark", "gather", "steer", "advance")
         }
         return calls | {
             "scatter": (transfer.scatter(real), self._inertia(w), None),
@@ -164,12 +174,15 @@ class StepLaunches:
                 None,
             ),
             "update_back": self._back("update", w, explicit["update"]),
+            "face_back": self._back("face", w, explicit["face"]),
+            "hold_back": self._back("hold", w, explicit["hold"]),
             "force_back": (
                 spread,
                 _inputs(self._force(w))
                 | from_place
                 | dict(
                     adjoint_grid=adjoint.grid, adjoint_v=own["unused"], adjoint_L=self.no_adjoint, adjoint_tau=own["T"],
+                    adjoint_mass=self.no_number, adjoint_volume=adjoint.volume,
                 ),
                 None,
             ),
@@ -189,6 +202,7 @@ class StepLaunches:
                 | from_place
                 | dict(
                     adjoint_grid=adjoint.grid, adjoint_v=adjoint_v, adjoint_L=now["L"], adjoint_tau=self.no_adjoint,
+                    adjoint_mass=adjoint.mass, adjoint_volume=self.no_number,
                 ),
                 None,
             ),

@@ -46,7 +46,7 @@ def solve(system: System, *, bounded: bool) -> Step:
     if not system.forces(v):
         raise NotConverged("particles left the grid, or their motion would fold them in one step")
     tangent = Tangent(system, symmetric=True)
-    if not system.mirrored:
+    if not system.coupled:
         blocks = torch.linalg.inv(tangent.inverse_blocks).diagonal(dim1=1, dim2=2).mean(1)[:, None]
         system.reach = torch.where(system.present > 0, system.mass / blocks, 1.0)
     tolerance = 1e-4 if v.dtype == torch.float32 else 1e-11

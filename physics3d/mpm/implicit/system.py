@@ -23,12 +23,12 @@ class System:
         """Scatter mass and momentum of state i, without stress, for the step by the first row of the clock."""
         arrays = launches.arrays
         self.launches = launches
-        self.mirrored: bool = arrays.mirrored
+        self.coupled: bool = arrays.coupled
         self.dx: float = arrays.dx
         self.dt, self.decay = float(clock[0, 0]), float(clock[0, 1])
         self.gravity: Tensor = torch.tensor(list(arrays.gravity), dtype=arrays.dtype, device=arrays.device)
         self.rounding: float = float(torch.finfo(arrays.dtype).eps)
-        self.particle_mass: Tensor = wp.to_torch(arrays.constant["mass"])  # [p] kg
+        self.particle_mass: Tensor = wp.to_torch(arrays.constant["whole_mass"])  # [p] kg
         self.volume: Tensor = wp.to_torch(arrays.constant["volume"])  # [p] m^3
         self.count: int = arrays.node_count
         self.grid: Tensor = wp.to_torch(arrays.grid)[:, : self.count]  # [worker, node, 4]
@@ -40,8 +40,12 @@ class System:
         if "mark" in launches.substeps.kernels:
             for w in range(arrays.workers):
                 arrays.new_stamp(w)
+        launches.grip()
         launches.on_particles("push", "scatter", "mark")
         total(self.grid)
+        if arrays.grips:
+            launches.on_nodes("face")
+            launches.on_nodes("lead")
         self.base: Tensor = self.grid[0].clone()  # [node, 4] at the start of the step
         self.momentum, m = self.base.split((3, 1), 1)  # [node, 3], [node, 1]
         self.present: Tensor = (m > arrays.mass_floor).to(m.dtype)
@@ -67,8 +71,8 @@ class System:
 
     def residual(self, v: Tensor) -> Tensor:
         """(v - B(v + s (u(v) - v)))/s [m/s] after `forces`. The root is the same for any s > 0; m over the diagonal of
-        M + K guesses the nodes that separate far better than s = 1, which mirrored walls need."""
-        if self.mirrored:
+        M + K guesses the nodes that separate far better than s = 1, which nodes that depend on each other need."""
+        if self.coupled:
             return v - self.update(gravity=True)
         u = self.present * self.decay * (self.grid[0, :, :3] / self.safe_mass + self.dt * self.gravity)
         return (v - self.bounded(v + self.reach * (u - v))) / self.reach
