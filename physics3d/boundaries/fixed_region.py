@@ -1,8 +1,8 @@
 """Fixed region: nothing moves in this box, as if it were clamped (a stem in its pot, the held end of a bar).
 
-For good, or for start <= t < start + duration (held, then let go). Matter that is in the box AT REST is gripped, and of a
-particle that its face cuts, a cube at rest, the part inside: the body is held where the face is written, and what moves
-is smooth in the place of the face. Nodes in the box with nothing of that matter have no velocity, so what comes later
+For good, or for start <= t < start + duration (held, then let go). Matter that is in the box AT REST is gripped, and of
+a particle that its face cuts, a cube at rest, the part inside: the body is held where the face is written, and what
+moves is smooth in the place of the face. Nodes in the box with nothing of that matter have no velocity, so what comes later
 is stopped at the last of them."""
 
 import functools

@@ -143,8 +143,8 @@ class Adjoint:
         return 1 - side
 
     def gradients(self, first: State) -> tuple[torch.Tensor, ...]:
-        """Gradients of coefficients [k, p], q, initial velocity [p, 3], its gradient [p, 3, 3], rest position [p, 3] and
-        selection [boundary, p], from the adjoint of the first state (copies)."""
+        """Gradients of coefficients [k, p], q, initial velocity [p, 3], its gradient [p, 3, 3], rest position [p, 3]
+        and selection [boundary, p], from the adjoint of the first state (copies)."""
         q = torch.stack([wp.to_torch(array) for array in self.q]).sum(0)[: self.arrays.parameter_count]
         place = wp.to_torch(self.rest) + wp.to_torch(self.offset) / self.arrays.dx
         coefficients = wp.to_torch(self.coefficients).clone()
@@ -167,7 +167,8 @@ class Adjoint:
                 q=self.q[w], grid=self.grid, gripped=self.gripped, depth=self.depth, imposed=self.imposed,
             ),
             "update": dict(
-                q=self.q[w], grid=self.grid, depth=self.depth, imposed=self.imposed, node_velocity=self.node_velocity[0],
+                q=self.q[w], grid=self.grid, depth=self.depth, imposed=self.imposed,
+                node_velocity=self.node_velocity[0],
             ),
             "steer": dict(**at, v_gathered=b["v_gathered"], L_gathered=b["L_gathered"], v=b["v"], L=b["L"]),
             "advance": dict(

@@ -26,6 +26,7 @@ from physics3d.mpm.stencil import node_number, stencil
 from physics3d.warp_types import vector, vector4
 
 FREE, HELD = wp.constant(-1), wp.constant(-2)  # instead of the node that one follows
+NEAR = 0.25  # [cells] from the face: nodes that are nearer do not move by themselves
 
 
 @cache
