@@ -76,7 +76,7 @@ class AbstractBoundary(abc.ABC):
         return ()
 
     def selection(self, setting: Setting) -> Float[Tensor, " p"]:
-        """Weight per particle for `acceleration` and `grip`; 0 leaves the particle alone. Differentiable in the place."""
+        """Weight per particle for `acceleration` and `grip`; 0 leaves it alone. Differentiable in the place."""
         return torch.zeros(len(setting.position), dtype=torch.float64)
 
     def behind(self, setting: Setting) -> Float[Tensor, " p"]:

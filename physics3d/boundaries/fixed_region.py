@@ -2,8 +2,8 @@
 
 For good, or for start <= t < start + duration (held, then let go). Matter that is in the box AT REST is gripped, and of
 a particle that its face cuts, a cube at rest, the part inside: the body is held where the face is written, and what
-moves is smooth in the place of the face. Nodes in the box with nothing of that matter have no velocity, so what comes later
-is stopped at the last of them."""
+moves is smooth in the place of the face. Nodes in the box with nothing of that matter have no velocity, so what comes
+later is stopped at the last of them."""
 
 import functools
 import math

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from physics3d.mpm.hold import least_distance
 from physics3d.mpm.hooks import FIRST_SIGNAL, Hooks
 from physics3d.mpm.state import State, make_state
 from physics3d.mpm.threads import shares
@@ -58,6 +59,7 @@ class Arrays:
         self.row_count: int = len(coefficients)
         self.boundary_count: int = len(selection)
         self.mass_floor: float = 1e-12 * float(mass.mean())  # [kg], of nodes
+        self.least: float = least_distance(float(volume.median()) ** (1 / 3) / dx)
         vec3 = vector(self.real)
         self.constant: dict[str, Any] = {
             "whole_mass": wp.from_torch(mass),
@@ -161,6 +163,7 @@ class Arrays:
             "origin": self.origin,
             "gravity": self.gravity,
             "mass_floor": self.mass_floor,
+            "least": self.least,
             "walls": self.walls,
             "clock": self.clock,
             "row": self.row[w],

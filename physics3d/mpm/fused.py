@@ -84,11 +84,9 @@ def particle_pass(
                 x = rest[p] + place
                 for i in range(wp.static(grip_count)):
                     weight = selection[wp.static(grip_row[i]), p]
-                    if weight != real(0.0):
-                        if wp.static(grip[i])(weight, q, wp.static(grip_a[i]), clock, r, wp.static(grip_b[i])) >= real(
-                            1.0
-                        ):
-                            v, L = wp.static(steer[i])(x, q, wp.static(grip_a[i]), clock, r, wp.static(grip_b[i]))
+                    held = wp.static(grip[i])(weight, q, wp.static(grip_a[i]), clock, r, wp.static(grip_b[i]))
+                    if weight != real(0.0) and held >= real(1.0):
+                        v, L = wp.static(steer[i])(x, q, wp.static(grip_a[i]), clock, r, wp.static(grip_b[i]))
             place = place + dt * v
             deformation, stress = material(p, dt, L, H[p], coefficients, memory, memory_next)
             u_next[p] = place

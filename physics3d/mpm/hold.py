@@ -7,14 +7,14 @@ between both, in cells: with quadratic splines N and a plane face s cells away,
 
     c(s) = int_s^(3/2) N = (3/2 - s)^3/6 (1/2 < s < 3/2),   1/2 - 3 s/4 + s^3/3 (|s| < 1/2),   c(-s) = 1 - c(s)
 
-Nodes nearer than half a cell, or behind the face, follow the node before them: with V the imposed velocity the trial
-functions v - V are straight there and vanish on the face wherever it lies between nodes,
+Nodes behind the face or next to it follow the node before them: with V the imposed velocity the trial functions v - V
+are straight there and vanish on the face wherever it lies between nodes,
 
-    v_i = V_i + (s_i/s_k) (v_k - V_k),   s_k >= 1/2 the distance of the node k that i follows,
+    v_i = V_i + (s_i/s_k) (v_k - V_k),   s_k >= `least_distance` for the node k that i follows,
 
-and k moves with the momentum and the inertia of all that follow it (`update`), which is the projection that no energy
-comes from. A node that has nobody to follow takes V. Constraining unfitted splines by extension: Hoellig, Reif and Wipper
-(2001) Weighted extended B-spline approximation of Dirichlet problems.
+and k moves with the momentum and the inertia of all that follow it (`update`): a projection, which no energy comes
+from. A node that has nobody to follow takes V. Splines constrained by extension: Hoellig, Reif and Wipper (2001)
+Weighted extended B-spline approximation of Dirichlet problems.
 """
 
 from functools import cache
@@ -26,7 +26,14 @@ from physics3d.mpm.stencil import node_number, stencil
 from physics3d.warp_types import vector, vector4
 
 FREE, HELD = wp.constant(-1), wp.constant(-2)  # instead of the node that one follows
-NEAR = 0.25  # [cells] from the face: nodes that are nearer do not move by themselves
+
+
+def least_distance(spacing: float) -> float:
+    """Distance from the face of nodes that move by themselves [cells], for particles that are `spacing` cells apart.
+
+    The nearer, the less of a bend is lost. But there must be no more such nodes between two grips than particles in a
+    row, for what no particle feels slips: with a cell per particle, grips slipped at 0.5 and held at 0.6."""
+    return min(max(0.6 * spacing, 0.25), 0.6)
 
 
 @cache
@@ -63,9 +70,8 @@ def hold(real, grips: tuple[Hook, ...]) -> wp.Kernel:
         for h in range(wp.static(count)):
             weight = selection[wp.static(rows[h]), p]
             if weight != real(0.0):
-                share = wp.min(
-                    left, wp.static(functions[h])(weight, q, wp.static(a[h]), clock, row[0], wp.static(b[h]))
-                )
+                grip = wp.static(functions[h])(weight, q, wp.static(a[h]), clock, row[0], wp.static(b[h]))
+                share = wp.min(left, grip)
                 left = left - share
                 if share > real(0.0):
                     d = offset[p] + u[p] / dx
@@ -139,8 +145,7 @@ def face(real, grips: tuple[Hook, ...], steers: tuple[Hook, ...]) -> wp.Kernel:
         x = origin + dx * vec3(real(at[0]), real(at[1]), real(at[2]))
         for h in range(wp.static(count)):
             if owner == h:
-                speed, gradient = wp.static(functions[h])(x, q, wp.static(a[h]), clock, row[0], wp.static(b[h]))
-                v = speed
+                v, _ = wp.static(functions[h])(x, q, wp.static(a[h]), clock, row[0], wp.static(b[h]))
         depth[n] = s
         imposed[n] = v
 
@@ -156,6 +161,7 @@ def lead(real) -> wp.Kernel:
     def lead_kernel(
         # in
         first: int,  # node of thread 0
+        least: real,  # distance from the face of nodes that move by themselves [cells]
         mass_floor: real,  # [kg]
         window: wp.array(dtype=int),  # [6] lowest node and number of nodes along each axis
         grid: wp.array(dtype=vec4),  # [node] momentum [kg m/s], mass [kg]
@@ -167,16 +173,16 @@ def lead(real) -> wp.Kernel:
         ny, nz = window[4], window[5]
         at = wp.vec3i(window[0] + n / (ny * nz), window[1] + (n / nz) % ny, window[2] + n % nz)
         found = int(FREE)
-        if depth[n] < real(NEAR):
+        if depth[n] < least:
             found = int(HELD)
             steepest = real(0.0)
             for k in range(6):
                 step = wp.vec3i(0, 0, 0)
                 step[k % 3] = wp.where(k < 3, 1, -1)
                 one, two = node_number(at + step, window), node_number(at + step + step, window)
-                if one >= 0 and depth[wp.max(one, 0)] < real(NEAR):
+                if one >= 0 and depth[wp.max(one, 0)] < least:
                     one = -1
-                    if two >= 0 and depth[wp.max(two, 0)] >= real(NEAR):
+                    if two >= 0 and depth[wp.max(two, 0)] >= least:
                         one = two
                 if one >= 0 and grid[wp.max(one, 0)][3] > mass_floor:
                     slope = (depth[one] - depth[n]) / wp.where(one == two, real(2.0), real(1.0))

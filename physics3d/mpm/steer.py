@@ -39,9 +39,9 @@ def steer(real, grips: tuple[Hook, ...], steers: tuple[Hook, ...]) -> wp.Kernel:
         gradient = L_gathered[p]
         for i in range(wp.static(count)):
             weight = selection[wp.static(rows[i]), p]
-            if weight != real(0.0):
-                if wp.static(grip[i])(weight, q, wp.static(a[i]), clock, r, wp.static(b[i])) >= real(1.0):
-                    speed, gradient = wp.static(functions[i])(x, q, wp.static(a[i]), clock, r, wp.static(b[i]))
+            held = wp.static(grip[i])(weight, q, wp.static(a[i]), clock, r, wp.static(b[i]))
+            if weight != real(0.0) and held >= real(1.0):
+                speed, gradient = wp.static(functions[i])(x, q, wp.static(a[i]), clock, r, wp.static(b[i]))
         v[p] = speed
         L[p] = gradient
 

@@ -114,14 +114,13 @@ def update(
                     step = wp.vec3i(0, 0, 0)
                     step[k % 3] = wp.where(k < 6, 1, 2) * wp.where((k / 3) % 2 == 0, 1, -1)
                     other = node_number(middle + step, window)
-                    if other >= 0:
-                        if leader[other] == top:
-                            followed = 1
-                            ratio = depth[other] / depth[top]
-                            mass = grid[other][3]
-                            p = decay * vec3(grid[other][0], grid[other][1], grid[other][2])
-                            impulse = impulse + ratio * (p + mass * (fall - imposed[other]))
-                            inertia = inertia + ratio * ratio * mass
+                    if other >= 0 and leader[wp.max(other, 0)] == top:
+                        followed = 1
+                        ratio = depth[other] / depth[top]
+                        mass = grid[other][3]
+                        p = decay * vec3(grid[other][0], grid[other][1], grid[other][2])
+                        impulse = impulse + ratio * (p + mass * (fall - imposed[other]))
+                        inertia = inertia + ratio * ratio * mass
                 if followed == 1:
                     share = real(1.0)
                     if ahead >= 0:

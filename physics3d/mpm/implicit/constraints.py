@@ -1,7 +1,8 @@
 """P = dB/du: what the boundaries make of a change of node velocities.
 
-Each node has a 3 x 3 block, unless walls mirror or something grips: then nodes depend on each other, and P is applied by the adjoint of
-the boundaries or by differences. Where P is a projector (sticky, slip, separate) the unknowns move in its range.
+Each node has a 3 x 3 block, unless walls mirror or something grips: then nodes depend on each other, and P is applied
+by the adjoint of the boundaries or by differences. Where P is a projector (sticky, slip, separate) the unknowns move in
+its range.
 """
 
 import torch
