@@ -14,6 +14,7 @@ class Trajectory(AbstractArtifact):
 
     rest_position: Float[Tensor, "p 3"]  # [m]
     position: Float[Tensor, "t p 3"]  # [m]
+    velocity: Float[Tensor, "t p 3"]  # [m/s]; no gradient goes through it
     deformation: Float[Tensor, "t p 3 3"]  # total F
     fps: float
     health: dict[str, list[float]]  # per frame, numbers for a person to look at
@@ -22,10 +23,12 @@ class Trajectory(AbstractArtifact):
 
     def check(self) -> None:
         t, p = self.position.shape[:2]
-        if self.rest_position.shape != (p, 3) or self.deformation.shape != (t, p, 3, 3):
+        shapes = [tuple(value.shape) for value in (self.rest_position, self.position, self.velocity, self.deformation)]
+        if shapes != [(p, 3), (t, p, 3), (t, p, 3), (t, p, 3, 3)]:
             raise ValueError(
-                f"trajectory: rest_position {tuple(self.rest_position.shape)}, position {tuple(self.position.shape)} "
-                f"and deformation {tuple(self.deformation.shape)} disagree; expected [p, 3], [t, p, 3], [t, p, 3, 3]"
+                "trajectory: rest_position {}, position {}, velocity {} and deformation {} disagree; expected [p, 3], "
+                "[t, p, 3], [t, p, 3], [t, p, 3, 3]".format(*shapes)
             )
         require_finite("trajectory.position", self.position)
+        require_finite("trajectory.velocity", self.velocity)
         require_finite("trajectory.deformation", self.deformation)

@@ -95,6 +95,7 @@ def _on_cpu(trajectory: Trajectory) -> Trajectory:
     return Trajectory(
         rest_position=trajectory.rest_position.cpu(),
         position=trajectory.position.cpu(),
+        velocity=trajectory.velocity.cpu(),
         deformation=trajectory.deformation.cpu(),
         fps=trajectory.fps,
         health=trajectory.health,

@@ -20,7 +20,10 @@ def test_a_wrong_shape_is_refused():
 
 
 def test_a_wrong_shape_of_a_field_is_refused():
-    fields = dict(position=torch.zeros(2, 5, 3), deformation=torch.zeros(2, 5, 3, 3), fps=24, health={}, substeps=1)
+    fields = dict(
+        position=torch.zeros(2, 5, 3), velocity=torch.zeros(2, 5, 3), deformation=torch.zeros(2, 5, 3, 3), fps=24,
+        health={}, substeps=1,
+    )  # fmt: skip
     Trajectory(rest_position=torch.zeros(5, 3), substep_dt=0.1, **fields)
     with pytest.raises(TypeCheckError):
         Trajectory(rest_position=torch.zeros(4, 3), substep_dt=0.1, **fields)

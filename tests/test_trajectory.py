@@ -18,7 +18,8 @@ def test_trajectory_survives_a_file(tmp_path: Path):
 
 def test_parts_that_disagree_are_refused(unchecked, tmp_path: Path):
     trajectory = Trajectory(
-        rest_position=torch.zeros(5, 3), position=torch.zeros(2, 4, 3), deformation=torch.zeros(2, 5, 3, 3),
+        rest_position=torch.zeros(5, 3), position=torch.zeros(2, 4, 3), velocity=torch.zeros(2, 4, 3),
+        deformation=torch.zeros(2, 5, 3, 3),
         fps=24.0, health={}, substeps=1, substep_dt=0.1,
     )  # fmt: skip
     with pytest.raises(ValueError, match="disagree; expected"):

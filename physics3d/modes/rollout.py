@@ -160,6 +160,7 @@ class Solver:
         q = _Motion.apply(coefficients, start, loads, run)
         values, slopes = (torch.from_numpy(a) for a in (body.values, body.slopes))
         u = torch.stack([values @ a for a in q])
+        v = torch.stack([values @ torch.from_numpy(a) for a in run.velocities])
         Ft = torch.stack([(slopes @ a).reshape(-1, 3, 3) for a in q])  # transposed
         rest = self.position.to(device=device, dtype=torch.float64)
         place = lambda a: a.to(device=device, dtype=self.world.dtype)
@@ -167,6 +168,7 @@ class Solver:
         return Trajectory(
             rest_position=place(rest),
             position=place(rest + u.to(device)),
+            velocity=place(v),
             deformation=place(Ft.mT + one),
             fps=1.0 / frame_dt,
             health=run.health,
@@ -208,6 +210,7 @@ class _Run:
     counts: list[int] = field(default_factory=list)
     health: dict[str, list[float]] = field(default_factory=dict)
     taken: list[list] = field(default_factory=list)
+    velocities: list[np.ndarray] = field(default_factory=list)  # amplitudes [r, 3] of each frame [m/s]
 
     def forward(self, v: np.ndarray, loads: np.ndarray, keep: bool) -> np.ndarray:
         """Amplitudes [t, r, 3] of every frame."""
@@ -282,7 +285,8 @@ class _Run:
         return max(1, math.ceil(self.frame_dt * fastest / (2 * math.pi) * STEPS))
 
     def _look(self, q: np.ndarray, v: np.ndarray, frame: int) -> None:
-        """Health of a frame, by the names of the solver with a grid."""
+        """Velocity and health of a frame, by the names of the solver with a grid."""
+        self.velocities.append(v)
         world, body, points = self.solver.world, self.solver.model, self.system.points
         H = (body.gradient @ q).reshape(-1, 3, 3)
         F = H + np.eye(3)

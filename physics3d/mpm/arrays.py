@@ -1,8 +1,8 @@
 """All that one rollout keeps on its device: the body, states, the clock, the grid.
 
 Everything is sized once; only the grid grows when the particles spread out. The grid is a window of nodes around the
-particles; each worker scatters into one of its own. `clock` is a table with one row per substep of a run: dt,
-exp(-damping dt), then the signals of the boundaries.
+particles; each worker scatters into one of its own. `clock` is a table with one row per substep of a run: dt, how long
+places go on [s]; exp(-damping kick); kick, how long forces act [s]; then the signals of the boundaries.
 """
 
 from collections.abc import Sequence

@@ -39,12 +39,14 @@ class Checkpoints:
         self.needed = {k for k in self.needed if k < first}
 
     def recall(self, i: int, state: Tensor, replay: Callable[[int], None]) -> None:
-        """Write state i into `state`; replay(k) must carry `state` from k to k + 1. States after i are forgotten."""
-        self.forget(i + 1)
+        """Write state i into `state`; replay(k) must carry `state` from k to k + 1. States after i are forgotten, but
+        for those that were needed: a second way back needs them again."""
+        for k in [k for k in self.kept if k > i and k not in self.needed]:
+            del self.kept[k]
         if i in self.kept:
             state.copy_(self.kept[i])
             return
-        start = max(self.kept)
+        start = max(k for k in self.kept if k < i)
         state.copy_(self.kept[start])
         free = max(0, (self.most or 0) - self._counted())
         stride = -(-(i - start) // (free + 1))

@@ -61,11 +61,13 @@ class Frames:
         self.body = make_body(problem, coefficients, q, position, selection)
         self.substeps = self.body.substeps
         self.arrays = self.substeps.arrays
+        self.pushes: list[bool] = [b.acceleration(self.arrays.real) is not None for b in problem.boundaries]
         self.implicit: ImplicitSubsteps | None = None
         self.adjoint: Adjoint | None = None
         self.keep = keep
         self.now_implicit: bool = False  # once the scheme is implicit, it stays so
         self.no_implicit: bool = False  # the automatic scheme has tried it in vain
+        self.behind: float = 0.0  # velocities lag by so much behind places [s]
         self.current: int = 0  # number of the state that the particles are in
         self.initial: Tensor | None = None  # state 0 before the first substep, flat
         self.runs: list[list[Run]] = []  # of each frame
@@ -77,29 +79,30 @@ class Frames:
         state_bytes = self.arrays.state(0).flat.nbytes
         self.checkpoints = Checkpoints(None if most is None else max(1, most // state_bytes))
 
-    def forward(self, velocity: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
-        """Displacements [t, p, 3] and total deformations [t, p, 3, 3], from the initial velocity [p, 3] and its
-        gradient [p, 3, 3]."""
+    def forward(self, velocity: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Displacements, velocities [t, p, 3] and total deformations [t, p, 3, 3], from the initial velocity [p, 3] and
+        its gradient [p, 3, 3]."""
         world, frames, n = self.problem.world, self.problem.frames, self.arrays.n
         first = self.arrays.state(0)
         first.memory.copy_(world.material.initial_memory(n, world.dtype))
         first.v_gathered.copy_(velocity)
         first.L_gathered.copy_(gradient)
         self.initial = first.flat.clone() if self.keep else None
-        self.substeps.start(self._clock(0.0, 0.0, 1), 0, 0)
+        self.substeps.start(self._clock(0.0, 0.0, 1, kick=0.0), 0, 0)
         kind: dict[str, Any] = {"dtype": world.dtype, "device": self.problem.device}
-        u, deformation = torch.empty((frames, n, 3), **kind), torch.empty((frames, n, 3, 3), **kind)
+        u, v = torch.empty((frames, n, 3), **kind), torch.empty((frames, n, 3), **kind)
+        deformation = torch.empty((frames, n, 3, 3), **kind)
         eye = torch.eye(3, **kind)
         for frame in self.problem.log.progress(range(frames), "simulate"):
             self.work = Work()
             if frame:
                 self._frame(frame)
             now = self._now()
-            u[frame], deformation[frame] = now.u, now.H + eye
+            u[frame], v[frame], deformation[frame] = now.u, self._velocity(frame), now.H + eye
             substeps = self.counts[-1] if self.counts else 0
             for name, value in health(self.body, now, self.work, substeps).items():
                 self.health.setdefault(name, []).append(value)
-        return u, deformation
+        return u, v, deformation
 
     def backward(self, adjoint_u: Tensor, adjoint_F: Tensor) -> tuple[Tensor, ...]:
         """Gradients of coefficients, q, velocity, its gradient, position, and selection."""
@@ -136,8 +139,20 @@ class Frames:
         adjoint.states[side].H.add_(adjoint_F[0])
         assert self.initial is not None
         arrays.state(0).flat.copy_(self.initial)
-        side = adjoint.reverse_start(self._clock(0.0, 0.0, 1), 0, 1, side)
+        side = adjoint.reverse_start(self._clock(0.0, 0.0, 1, kick=0.0), 0, 1, side)
         return adjoint.gradients(adjoint.states[side])
+
+    def _velocity(self, frame: int) -> Tensor:
+        """Of the particles at the frame [p, 3]."""
+        now = self._now()
+        if self.behind == 0:
+            return now.v
+        dt = 2 * self.behind
+        lowest, size = window(self.problem.world, self.body.look(now), steps=1, dt=dt, reach=2.0, frame=frame)
+        self.arrays.set_window(lowest, size)
+        clock = self._clock(frame * self.problem.frame_dt, dt, 1, kick=self.behind)
+        self.substeps.look(clock, self.current, 1 - self.current)
+        return self.arrays.state(1 - self.current).v
 
     def _now(self) -> State:
         return self.arrays.state(self.current)
@@ -145,7 +160,7 @@ class Frames:
     def _frame(self, frame: int) -> None:
         """From one frame to the next, in equal substeps that obey the limit; more of them if it turns out too fast."""
         world, frame_dt = self.problem.world, self.problem.frame_dt
-        start = self._now().flat.clone()
+        start, behind = self._now().flat.clone(), self.behind
         begun = sum(len(runs) for runs in self.runs)
         self._choose(frame)
         count, reach = self._count(frame), 2.0
@@ -160,6 +175,7 @@ class Frames:
             except TooFast as reason:
                 why, remedy = str(reason), reason.remedy
                 self._now().flat.copy_(start)
+                self.behind = behind
                 self.checkpoints.forget(begun)
                 self.work.rejected += 1
                 reach = min(2 * reach, 8.0)
@@ -215,7 +231,8 @@ class Frames:
             now = self._now()
             lowest, size = window(self.problem.world, self.body.look(now), steps=0, dt=dt, reach=0.0, frame=frame)
             self.arrays.set_window(lowest, size)
-            clock = self._clock((frame - 1) * self.problem.frame_dt + done * dt, dt, 1)
+            clock = self._clock((frame - 1) * self.problem.frame_dt + done * dt, dt, 1, kick=self.behind + dt)
+            self.behind = 0.0
             if self.keep:
                 self._checkpoint(len(runs), now, needed=True)
             try:
@@ -242,7 +259,9 @@ class Frames:
             seen = self.body.look(now)
             lowest, size = window(self.problem.world, seen, steps=steps, dt=dt, reach=reach, frame=frame)
             self.arrays.set_window(lowest, size)
-            clock = self._clock((frame - 1) * self.problem.frame_dt + done * dt, dt, steps)
+            t = (frame - 1) * self.problem.frame_dt + done * dt
+            clock = self._clock(t, dt, steps, kick=self.behind + dt / 2)
+            self.behind = dt / 2
             if self.keep:
                 self._checkpoint(len(runs), now)
             runs.append(Run(lowest, size, clock))
@@ -287,12 +306,22 @@ class Frames:
                 f"{self.problem.corners()}; enlarge world.lower and world.upper, or add a BoundingBox or a HalfSpace"
             )
 
-    def _clock(self, t: float, dt: float, steps: int) -> np.ndarray:
-        """Table for the kernels, from time t [s] on: dt, exp(-damping dt), signals of all boundaries."""
+    def _clock(self, t: float, dt: float, steps: int, *, kick: float) -> np.ndarray:
+        """Table for the kernels, from time t [s] on; `kick` of the first substep, those after it have dt, from where
+        velocities are at the moment.
+
+        Forces from outside are asked for the time of the kick, all else for that of the substep."""
         rows = []
         for s in range(steps):
-            signals = [x for boundary in self.problem.boundaries for x in boundary.signals(t + s * dt, dt)]
-            rows.append([dt, math.exp(-self.problem.world.damping * dt), *signals])
+            begin, long = t - self.behind, kick
+            if s:
+                begin, long = begin + kick + (s - 1) * dt, dt
+            signals = [
+                x
+                for boundary, pushes in zip(self.problem.boundaries, self.pushes)
+                for x in (boundary.signals(begin, long) if pushes else boundary.signals(t + s * dt, dt))
+            ]
+            rows.append([dt, math.exp(-self.problem.world.damping * long), long, *signals])
         return np.array(rows)
 
     def _who(self, chosen: Tensor) -> str:

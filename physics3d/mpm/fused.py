@@ -10,7 +10,7 @@ from functools import cache
 import warp as wp
 
 from physics3d.mpm import columns
-from physics3d.mpm.hooks import Hook, columns_of
+from physics3d.mpm.hooks import KICK, Hook, columns_of
 from physics3d.mpm.stencil import stencil
 from physics3d.warp_types import matrix, vector, vector4
 
@@ -34,7 +34,7 @@ def particle_pass(
         first: int,  # particle of thread 0
         dx: real,  # [m]
         window: wp.array(dtype=int),  # [6] lowest node and number of nodes along each axis
-        clock: wp.array2d(dtype=real),  # [substep, k] dt [s], exp(-damping dt), signals of the boundaries
+        clock: wp.array2d(dtype=real),  # [substep, k] as in `arrays`
         row: wp.array(dtype=int),  # [1] the substep
         keep: int,  # 1: write velocities and stress too
         onward: int,  # 1: scatter for the next substep
@@ -97,14 +97,14 @@ def particle_pass(
                 tau_next[p] = stress
             if onward == 1:
                 r = r + 1
-                dt = clock[r, 0]
+                kick = clock[r, wp.static(KICK)]
                 if wp.static(push_count > 0):
                     x = rest[p] + place
                     pushed = v
                     for i in range(wp.static(push_count)):
                         weight = selection[wp.static(push_row[i]), p]
                         if weight != real(0.0):
-                            pushed = pushed + dt * wp.static(push[i])(
+                            pushed = pushed + kick * wp.static(push[i])(
                                 weight, x, q, wp.static(push_a[i]), clock, r, wp.static(push_b[i])
                             )
                     v = pushed
@@ -121,7 +121,7 @@ def particle_pass(
                                 wp.static(grip[i])(weight, q, wp.static(grip_a[i]), clock, r, wp.static(grip_b[i])),
                             )
                     m = left * whole_mass[p]
-                    A = (m * dx) * L - (real(4.0) * dt * left * whole_volume[p] / dx) * stress
+                    A = (m * dx) * L - (real(4.0) * kick * left * whole_volume[p] / dx) * stress
                     spread(grid, node, ny, nz, weights(f), m * v - A * f, m, A)
                 else:
                     wp.atomic_add(lost, 0, 1)

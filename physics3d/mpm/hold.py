@@ -50,7 +50,7 @@ def hold(real, grips: tuple[Hook, ...]) -> wp.Kernel:
         first: int,  # particle of thread 0
         dx: real,  # [m]
         window: wp.array(dtype=int),  # [6] lowest node and number of nodes along each axis
-        clock: wp.array2d(dtype=real),  # [substep, k] dt [s], exp(-damping dt), signals of the boundaries
+        clock: wp.array2d(dtype=real),  # [substep, k] as in `arrays`
         row: wp.array(dtype=int),  # [1] the substep
         selection: wp.array2d(dtype=real),  # [boundary, p]
         q: wp.array(dtype=real),  # [k] parameters of the boundaries
@@ -106,7 +106,7 @@ def face(real, grips: tuple[Hook, ...], steers: tuple[Hook, ...]) -> wp.Kernel:
         origin: vec3,  # place of node (0, 0, 0) [m]
         mass_floor: real,  # [kg]
         window: wp.array(dtype=int),  # [6] lowest node and number of nodes along each axis
-        clock: wp.array2d(dtype=real),  # [substep, k] dt [s], exp(-damping dt), signals of the boundaries
+        clock: wp.array2d(dtype=real),  # [substep, k] as in `arrays`
         row: wp.array(dtype=int),  # [1] the substep
         q: wp.array(dtype=real),  # [k] parameters of the boundaries
         gripped: wp.array(dtype=real),  # [grip x node] [kg]

@@ -19,7 +19,7 @@ import warp as wp
 
 from physics3d.boundaries.base import AbstractBoundary
 
-FIRST_SIGNAL = 2  # column of the clock; those before are dt and exp(-damping dt)
+DECAY, KICK, FIRST_SIGNAL = 1, 2, 3  # columns of the clock; the first one is dt
 
 
 class Hook(NamedTuple):

@@ -23,7 +23,7 @@ def mark(real, hooks: tuple[Hook, ...]) -> wp.Kernel:
         first: int,  # particle of thread 0
         dx: real,  # [m]
         window: wp.array(dtype=int),  # [6] lowest node and number of nodes along each axis
-        clock: wp.array2d(dtype=real),  # [substep, k] dt [s], exp(-damping dt), signals of the boundaries
+        clock: wp.array2d(dtype=real),  # [substep, k] as in `arrays`
         row: wp.array(dtype=int),  # [1] the substep
         stamp: wp.array(dtype=int),  # [1] another one in every substep, so that nothing need be cleared
         rest: wp.array(dtype=vec3),  # [p] [m]

@@ -4,7 +4,7 @@ from functools import cache
 
 import warp as wp
 
-from physics3d.mpm.hooks import Hook, columns_of
+from physics3d.mpm.hooks import KICK, Hook, columns_of
 from physics3d.warp_types import vector
 
 
@@ -19,7 +19,7 @@ def push(real, hooks: tuple[Hook, ...]) -> wp.Kernel:
     def push_kernel(
         # in
         first: int,  # particle of thread 0
-        clock: wp.array2d(dtype=real),  # [substep, k] dt [s], exp(-damping dt), signals of the boundaries
+        clock: wp.array2d(dtype=real),  # [substep, k] as in `arrays`
         row: wp.array(dtype=int),  # [1] the substep
         selection: wp.array2d(dtype=real),  # [boundary, p]
         rest: wp.array(dtype=vec3),  # [p] [m]
@@ -31,13 +31,13 @@ def push(real, hooks: tuple[Hook, ...]) -> wp.Kernel:
     ):
         p = wp.tid() + first
         r = row[0]
-        dt = clock[r, 0]
+        kick = clock[r, wp.static(KICK)]
         x = rest[p] + u[p]
         total = v[p]
         for i in range(wp.static(count)):
             weight = selection[wp.static(rows[i]), p]
             if weight != real(0.0):
-                total = total + dt * wp.static(functions[i])(weight, x, q, wp.static(a[i]), clock, r, wp.static(b[i]))
+                total = total + kick * wp.static(functions[i])(weight, x, q, wp.static(a[i]), clock, r, wp.static(b[i]))
         v_pushed[p] = total
 
     return push_kernel

@@ -84,7 +84,7 @@ def rollout(
         threads=threads,
         log=log,
     )
-    u, deformation, done = _Rollout.apply(
+    u, v, deformation, done = _Rollout.apply(
         coefficients,
         place(torch.cat(q)) if q else torch.zeros(0, dtype=dtype, device=device),
         place(velocity.to(device).expand(n, 3)[order]),
@@ -97,6 +97,7 @@ def rollout(
     return Trajectory(
         rest_position=place(rest),
         position=place(rest + u[:, back].double()),
+        velocity=v[:, back],
         deformation=deformation[:, back],
         fps=1.0 / frame_dt,
         health=done.health,
@@ -107,7 +108,7 @@ def rollout(
 
 class _Rollout(torch.autograd.Function):
     """(coefficients [k, p], q, velocity [p, 3], its gradient [p, 3, 3], position [p, 3], selection [boundary, p]) ->
-    displacement [t, p, 3], deformation [t, p, 3, 3], and the frames as they were done."""
+    displacement and velocity [t, p, 3], deformation [t, p, 3, 3], and the frames as they were done."""
 
     @staticmethod
     def forward(ctx, coefficients, q, velocity, gradient, position, selection, problem: Problem):
@@ -115,9 +116,10 @@ class _Rollout(torch.autograd.Function):
         inputs = (coefficients, q, velocity, gradient, position, selection)
         coefficients, q, velocity, gradient, position, selection = (value.detach() for value in inputs)
         ctx.frames = Frames(problem, coefficients, q, position, selection.contiguous(), keep=any(ctx.needs_input_grad))
-        u, deformation = ctx.frames.forward(velocity, gradient)
-        return u, deformation, ctx.frames
+        u, v, deformation = ctx.frames.forward(velocity, gradient)
+        ctx.mark_non_differentiable(v)
+        return u, v, deformation, ctx.frames
 
     @staticmethod
-    def backward(ctx, adjoint_u, adjoint_F, _):
+    def backward(ctx, adjoint_u, _v, adjoint_F, _):
         return (*ctx.frames.backward(adjoint_u, adjoint_F), None)

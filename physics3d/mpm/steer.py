@@ -20,7 +20,7 @@ def steer(real, grips: tuple[Hook, ...], steers: tuple[Hook, ...]) -> wp.Kernel:
     def steer_kernel(
         # in
         first: int,  # particle of thread 0
-        clock: wp.array2d(dtype=real),  # [substep, k] dt [s], exp(-damping dt), signals of the boundaries
+        clock: wp.array2d(dtype=real),  # [substep, k] as in `arrays`
         row: wp.array(dtype=int),  # [1] the substep
         selection: wp.array2d(dtype=real),  # [boundary, p]
         rest: wp.array(dtype=vec3),  # [p] [m]

@@ -2,13 +2,17 @@
 
     hold     what is gripped of a particle has no part in the rest   (only if a boundary grips some)
     push     v_p += dt a_p                                        forces from outside (only if a boundary has some)
-    scatter  particles -> momentum and mass of nodes
+    scatter  particles -> momentum and mass of nodes, after the kick of the internal forces
     mark     the nodes of particles that touch a boundary         (only if a boundary acts on those alone)
     face     how far nodes are from what is gripped, then lead: which node they follow       (likewise)
-    update   v_i = e^(-c dt) (p_i/m_i + dt g), then the boundaries
+    update   v_i = e^(-c kick) (p_i/m_i + kick g), then the boundaries
     gather   nodes -> v_p, L_p
     steer    imposed motion of particles                          (only if a boundary grips some)
     advance  u_p += dt v_p; the material turns (L_p, H_p) into the next H_p and the stress for the next scatter
+
+Velocities live half a substep before places (leapfrog): forces act over `kick`, which is half a substep in the first
+one and (dt_before + dt)/2 later. Places are of second order that way, and velocities at a frame are, after half a kick
+more (`look`). An implicit step has kick = dt.
 
 Each is a kernel in a file of its name (scatter and gather are in `transfer`). Every array of a state is written once
 per substep and nothing is updated in place, so the adjoints of the kernels can be launched in reverse order
@@ -117,6 +121,28 @@ class Substeps:
 
         on_all(arrays.workers, fast if arrays.fast else plain)
         return sum(int(lost.numpy()[0]) for lost in arrays.lost)
+
+    def look(self, clock: np.ndarray, i: int, j: int) -> None:
+        """Velocity of state j = that of state i after a kick, and nothing else: no place changes. State j is spoilt."""
+        arrays = self.arrays
+        arrays.set_clock(clock)
+        launches = [self.launches(w, i, j) for w in range(arrays.workers)]
+        nodes = shares(arrays.node_count, arrays.workers)
+
+        def worker(w: int, wait: Wait) -> None:
+            launch = launches[w]
+            arrays.set_row(w, 0)
+            self.hold(launch)
+            self.scatter(launch)
+            self.mark(w, launch)
+            wait()
+            self.update(launch, *nodes[w], wait)
+            wait()
+            for name in ("gather", "steer"):
+                if name in launch:
+                    launch[name].launch()
+
+        on_all(arrays.workers, worker)
 
     def start(self, clock: np.ndarray, i: int, j: int) -> None:
         """State j = state i with its stress, and with imposed motion: a substep of no length, without the grid."""

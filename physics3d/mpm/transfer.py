@@ -19,6 +19,7 @@ from functools import cache
 import warp as wp
 
 from physics3d.mpm import columns
+from physics3d.mpm.hooks import KICK
 from physics3d.mpm.stencil import stencil
 from physics3d.warp_types import matrix, vector, vector4
 
@@ -36,7 +37,7 @@ def scatter(real, fast: bool = False) -> wp.Kernel:
         first: int,  # particle of thread 0
         dx: real,  # [m]
         window: wp.array(dtype=int),  # [6] lowest node and number of nodes along each axis
-        clock: wp.array2d(dtype=real),  # [substep, k] column 0: dt [s]
+        clock: wp.array2d(dtype=real),  # [substep, k] column KICK: how long forces act [s]
         row: wp.array(dtype=int),  # [1] the substep
         mass: wp.array(dtype=real),  # [p] [kg]
         volume: wp.array(dtype=real),  # [p] at rest [m^3]
@@ -51,7 +52,7 @@ def scatter(real, fast: bool = False) -> wp.Kernel:
         lost: wp.array(dtype=int),  # [1] particles outside the window, added to
     ):
         p = wp.tid() + first
-        dt = clock[row[0], 0]
+        kick = clock[row[0], wp.static(KICK)]
         d = offset[p] + u[p] / dx
         node = first_node(cell[p], d, window)
         ny, nz = window[4], window[5]
@@ -59,7 +60,7 @@ def scatter(real, fast: bool = False) -> wp.Kernel:
             f = local(d)
             w = weights(f)
             m = mass[p]
-            A = (m * dx) * L[p] - (real(4.0) * dt * volume[p] / dx) * tau[p]
+            A = (m * dx) * L[p] - (real(4.0) * kick * volume[p] / dx) * tau[p]
             q = m * v[p] - A * f
             spread(grid, node, ny, nz, w, q, m, A)
         else:
@@ -122,7 +123,7 @@ def scatter_adjoint(real, fast: bool = False) -> wp.Kernel:
         first: int,  # particle of thread 0
         dx: real,  # [m]
         window: wp.array(dtype=int),  # [6] lowest node and number of nodes along each axis
-        clock: wp.array2d(dtype=real),  # [substep, k] column 0: dt [s]
+        clock: wp.array2d(dtype=real),  # [substep, k] column KICK: how long forces act [s]
         row: wp.array(dtype=int),  # [1] the substep
         mass: wp.array(dtype=real),  # [p] [kg]
         volume: wp.array(dtype=real),  # [p] at rest [m^3]
@@ -143,7 +144,7 @@ def scatter_adjoint(real, fast: bool = False) -> wp.Kernel:
         adjoint_volume: wp.array(dtype=real),  # [p]
     ):
         p = wp.tid() + first
-        dt = clock[row[0], 0]
+        kick = clock[row[0], wp.static(KICK)]
         d = offset[p] + u[p] / dx
         node = first_node(cell[p], d, window)
         ny, nz = window[4], window[5]
@@ -151,7 +152,7 @@ def scatter_adjoint(real, fast: bool = False) -> wp.Kernel:
             f = local(d)
             w, g = weights(f), slopes(f)
             m = mass[p]
-            stress = real(4.0) * dt * volume[p] / dx
+            stress = real(4.0) * kick * volume[p] / dx
             A = (m * dx) * L[p] - stress * tau[p]
             S = spread_adjoint(adjoint_grid, node, ny, nz, f, w, g, m * v[p] - A * f, m, A)
             mean, slope = vec3(S[0, 0], S[0, 1], S[0, 2]), vec3(S[4, 0], S[4, 1], S[4, 2])
@@ -163,7 +164,7 @@ def scatter_adjoint(real, fast: bool = False) -> wp.Kernel:
             adjoint_L[p] = adjoint_L[p] + (m * dx) * B
             adjoint_tau[p] = adjoint_tau[p] - stress * B
             adjoint_mass[p] = adjoint_mass[p] + wp.dot(mean, v[p]) + S[0, 3] + dx * wp.ddot(L[p], B)
-            adjoint_volume[p] = adjoint_volume[p] - (real(4.0) * dt / dx) * wp.ddot(tau[p], B)
+            adjoint_volume[p] = adjoint_volume[p] - (real(4.0) * kick / dx) * wp.ddot(tau[p], B)
 
     return scatter_adjoint_kernel
 

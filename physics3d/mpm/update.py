@@ -15,7 +15,7 @@ from functools import cache
 import warp as wp
 
 from physics3d.mpm.hold import FREE, HELD
-from physics3d.mpm.hooks import Hook, columns_of
+from physics3d.mpm.hooks import DECAY, KICK, Hook, columns_of
 from physics3d.mpm.mirror import mirror
 from physics3d.mpm.stencil import node_number
 from physics3d.warp_types import vector, vector4
@@ -46,7 +46,7 @@ def update(
         gravity: vec3,  # [m/s^2]
         mass_floor: real,  # lighter nodes stay at rest [kg]
         window: wp.array(dtype=int),  # [6] lowest node and number of nodes along each axis
-        clock: wp.array2d(dtype=real),  # [substep, k] dt [s], exp(-damping dt), signals of the boundaries
+        clock: wp.array2d(dtype=real),  # [substep, k] as in `arrays`
         row: wp.array(dtype=int),  # [1] the substep
         walls: wp.array(dtype=int),  # [12] see `mirror`
         stamp: wp.array(dtype=int),  # [1] of what is touched in this substep
@@ -87,7 +87,7 @@ def update(
                 here = node_number(at, window)
         m = node[3]
         v = vec3()
-        decay, fall = clock[r, 1], (clock[r, 1] * clock[r, 0]) * gravity
+        decay, fall = clock[r, wp.static(DECAY)], (clock[r, wp.static(DECAY)] * clock[r, wp.static(KICK)]) * gravity
         moves = m > mass_floor
         if moves:
             v = decay * (vec3(node[0], node[1], node[2]) / m) + fall

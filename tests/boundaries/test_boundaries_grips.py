@@ -70,9 +70,10 @@ def test_a_grip_bears_what_hangs_on_it():
     z = position[:, 2] - 0.04
     stress = 1e6 * (motion.deformation[-1, :, 2, 2] - 1)
     free = z < 0.7
-    for layer in z[free].unique()[2:]:  # the free end is felt half a cell in
-        # a tenth of a cell at the free end, and strains of half a per cent are linear to as much
-        assert float(stress[z == layer].mean()) == pytest.approx(9810 * float(layer), rel=0.02, abs=0.1 * DX * 9810)
+    # a tenth of a cell is lost at the free end, and the cell next to the grip has 5 % more
+    for cell in range(7):
+        inside = free & (z > cell * DX) & (z < (cell + 1) * DX)
+        assert float(stress[inside].mean()) == pytest.approx(9810 * (cell + 0.5) * DX, rel=0.06, abs=0.1 * DX * 9810)
 
 
 def timoshenko(E: float, density: float, thickness: float, length: float, count: int = 300) -> float:

@@ -212,6 +212,17 @@ def test_adjoint_is_the_derivative_for_every_material(material):
     compare(lambda **some: loss(**some, **constant), inputs)
 
 
+def test_a_second_way_back_gives_the_same_gradient():
+    world = soft_world(scheme="implicit", dt=0.02, start=dict(youngs_modulus=1e6, poissons_ratio=0.3))
+    loss, inputs = make_loss(world, frame_dt=0.04, speed=0.1, excitation=(CLAMP,))
+    inputs = {name: value.double().requires_grad_() for name, value in inputs.items()}
+    value = loss(**inputs)
+    first = torch.autograd.grad(value, list(inputs.values()), retain_graph=True)
+    again = torch.autograd.grad(value, list(inputs.values()))
+    for one, two in zip(first, again):
+        assert torch.equal(one, two) and bool(one.any())
+
+
 # --- the choice -------------------------------------------------------------------------------------------------------
 
 

@@ -117,7 +117,7 @@ def switching(k_d: float) -> tuple[Tensor, Tensor, Tensor, Callable[[], Tensor]]
     lengths = [1e-3] * 20 + [1 / 30] * 3 + [1e-3] * 20 + [1 / 30] * 2
     velocities = []
     for i, dt in enumerate(lengths):
-        clock = np.array([[dt, 1.0]])
+        clock = np.array([[dt, 1.0, dt]])
         if dt < 0.01:
             assert substeps.run(clock, [i, i + 1]) == 0
             velocities.append(None)
@@ -131,7 +131,7 @@ def switching(k_d: float) -> tuple[Tensor, Tensor, Tensor, Callable[[], Tensor]]
         adjoint.states[0].tau.copy_(states[-1].tau / MU**2)
         side = 0
         for i in reversed(range(len(lengths))):
-            clock = np.array([[lengths[i], 1.0]])
+            clock = np.array([[lengths[i], 1.0, lengths[i]]])
             if velocities[i] is None:
                 side = adjoint.reverse(clock, [i, i + 1], side)
             else:

@@ -21,6 +21,7 @@ def test_motion_below_a_pixel_is_said(tmp_path, pixels, seen):
     trajectory = Trajectory(
         rest_position=body.position,
         position=position,
+        velocity=torch.zeros_like(position),
         deformation=torch.eye(3).expand(2, len(body.position), 3, 3).contiguous(),
         fps=10.0,
         health={},

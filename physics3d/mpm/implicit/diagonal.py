@@ -9,6 +9,7 @@ from functools import cache
 
 import warp as wp
 
+from physics3d.mpm.hooks import KICK
 from physics3d.mpm.stencil import stencil
 from physics3d.warp_types import matrix, vector
 
@@ -25,7 +26,7 @@ def diagonal(real) -> wp.Kernel:
         first: int,  # particle of thread 0
         dx: real,  # [m]
         window: wp.array(dtype=int),  # [6] lowest node and number of nodes along each axis
-        clock: wp.array2d(dtype=real),  # [substep, k] column 0: dt [s]
+        clock: wp.array2d(dtype=real),  # [substep, k] column KICK: how long forces act [s]
         row: wp.array(dtype=int),  # [1] the substep
         volume: wp.array(dtype=real),  # [p] at rest [m^3]
         cell: wp.array(dtype=wp.vec3i),  # [p] of the rest position
@@ -42,7 +43,7 @@ def diagonal(real) -> wp.Kernel:
         if node >= 0:
             f = local(d)
             weight = weights(f)
-            factor = real(16.0) * clock[row[0], 0] * volume[p] / (dx * dx)
+            factor = real(16.0) * clock[row[0], wp.static(KICK)] * volume[p] / (dx * dx)
             c1, c2 = factor * moduli[p, 0], factor * moduli[p, 1]
             unit, one = wp.identity(n=3, dtype=real), real(1.0)
             rx = -f[0]

@@ -10,6 +10,7 @@ from functools import cache
 import warp as wp
 
 from physics3d.mpm import columns
+from physics3d.mpm.hooks import KICK
 from physics3d.mpm.stencil import stencil
 from physics3d.warp_types import matrix, vector
 
@@ -27,7 +28,7 @@ def stiffness(real) -> wp.Kernel:
         first: int,  # particle of thread 0
         dx: real,  # [m]
         window: wp.array(dtype=int),  # [6] lowest node and number of nodes along each axis
-        clock: wp.array2d(dtype=real),  # [substep, k] column 0: dt [s]
+        clock: wp.array2d(dtype=real),  # [substep, k] column KICK: how long forces act [s]
         row: wp.array(dtype=int),  # [1] the substep
         volume: wp.array(dtype=real),  # [p] at rest [m^3]
         cell: wp.array(dtype=wp.vec3i),  # [p] of the rest position
@@ -55,7 +56,7 @@ def stiffness(real) -> wp.Kernel:
                         for e in range(3):
                             total = total + C[p, 27 * a + 9 * b + 3 * c + e] * L[c, e]
                     A[a, b] = total
-            A = (real(16.0) * clock[row[0], 0] * volume[p] / (dx * dx)) * A
+            A = (real(16.0) * clock[row[0], wp.static(KICK)] * volume[p] / (dx * dx)) * A
             spread(Kw, node, ny, nz, weight, -(A * f), A)
 
     return stiffness_kernel

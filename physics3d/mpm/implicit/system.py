@@ -1,9 +1,10 @@
 """The equations of one implicit step on the nodes: v = B(u(v)) for the node velocities v at its end.
 
-    u_i = e^(-c dt) [ (p_i + dt f_i(v))/m_i + dt g ]                                                      [m/s]
+    u_i = e^(-c h) [ (p_i + h f_i(v))/m_i + h g ]                                                      [m/s]
     f_i = -(4/dx^2) sum_p V_p w_ip T_p (x_i - x_p)                                                        [N]
 
-B is what the boundaries make of u; weights and places are those of the start of the step.
+B is what the boundaries make of u; h is dt, and after an explicit substep also what its velocities lag behind; weights
+and places are those of the start of the step.
 """
 
 import math
@@ -13,6 +14,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from physics3d.mpm.hooks import DECAY, KICK
 from physics3d.mpm.implicit.launches import StepLaunches, total
 
 
@@ -25,7 +27,7 @@ class System:
         self.launches = launches
         self.coupled: bool = arrays.coupled
         self.dx: float = arrays.dx
-        self.dt, self.decay = float(clock[0, 0]), float(clock[0, 1])
+        self.kick, self.decay = float(clock[0, KICK]), float(clock[0, DECAY])
         self.gravity: Tensor = torch.tensor(list(arrays.gravity), dtype=arrays.dtype, device=arrays.device)
         self.rounding: float = float(torch.finfo(arrays.dtype).eps)
         self.particle_mass: Tensor = wp.to_torch(arrays.constant["whole_mass"])  # [p] kg
@@ -74,7 +76,7 @@ class System:
         M + K guesses the nodes that separate far better than s = 1, which nodes that depend on each other need."""
         if self.coupled:
             return v - self.update(gravity=True)
-        u = self.present * self.decay * (self.grid[0, :, :3] / self.safe_mass + self.dt * self.gravity)
+        u = self.present * self.decay * (self.grid[0, :, :3] / self.safe_mass + self.kick * self.gravity)
         return (v - self.bounded(v + self.reach * (u - v))) / self.reach
 
     def bounded(self, v: Tensor) -> Tensor:
@@ -92,7 +94,7 @@ class System:
         """What rounding leaves of a residual [kg^1/2 m/s]: of the velocities, and of the impulse of each particle, the
         tangent of which has the norm `stiffness` [p]."""
         stress = wp.to_torch(self.launches.T).flatten(1).norm(dim=1) + stiffness * (float(v.abs().max()) / self.dx)
-        impulse = (2 * self.dt / self.dx) * self.volume * stress
+        impulse = (2 * self.kick / self.dx) * self.volume * stress
         return self.rounding * (self.norm(v) + math.sqrt(float((impulse**2 / self.particle_mass).sum())))
 
     def norm(self, v: Tensor) -> float:
