@@ -14,6 +14,7 @@ from physics3d.boundaries.enforced_translation import EnforcedTranslation
 from physics3d.boundaries.fixed_region import FixedRegion
 from physics3d.boundaries.half_space import HalfSpace
 from physics3d.boundaries.held_particles import HeldParticles
+from physics3d.boundaries.imposed_motion import ImposedMotion
 from physics3d.boundaries.impulse import Impulse
 from physics3d.boundaries.mesh_collider import MeshCollider
 from physics3d.boundaries.moving_cuboid import MovingCuboid
@@ -93,6 +94,20 @@ EXAMPLES: list[AbstractBoundary] = [
     FixedRegion(lower=(-0.1, -0.1, -0.1), upper=(0.1, 0.4, 0.4)),
     HeldParticles(position=((0.05, 0.05, 0.02), (0.05, 0.22, 0.02), (0.22, 0.1, 0.04))),
     Impulse(force=(30.0, 5.0, -4.0), centre=(0.2, 0.2, 0.2), radius=0.12, start=0.013, duration=0.03),
+    ImposedMotion(
+        lower=(-0.1, -0.1, -0.1),
+        upper=(0.4, 0.4, 0.1),
+        hole_lower=(0.1, 0.1, -0.1),
+        hole_upper=(0.4, 0.4, 0.1),
+        times=(0.0, 0.02, 0.05),
+        displacement=((0.0, 0.0, 0.0), (0.004, 0.0, -0.002), (0.0, 0.003, 0.0)),
+        deformation=(
+            ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+            ((1.02, 0.03, 0.0), (0.0, 1.0, 0.0), (0.0, 0.01, 0.98)),
+            ((1.0, 0.05, 0.0), (-0.05, 1.0, 0.0), (0.0, 0.0, 1.0)),
+        ),
+        centre=(0.1, 0.0, 0.0),
+    ),
     MeshCollider(  # a corner of a cube that turns as it moves into the block
         vertices=((-0.1, -0.1, -0.1), (0.25, -0.1, -0.1), (-0.1, 0.25, -0.1), (-0.1, -0.1, 0.25)),
         triangles=((0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)),

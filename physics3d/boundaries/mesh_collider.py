@@ -2,7 +2,7 @@
 
 The mesh is placed at y = R0 (scale X), x = p(t) + R(t) y, where R0 turns by the vector `rotation`. While
 start <= t < start + duration it moves with `velocity` and turns with `angular_velocity` w about `position`; before and
-after that it stands still:
+after that it stands still, and from `end` on it is gone:
 
     p(t) = position + s velocity,   R(t) = exp(s [w]x),   s = min(max(t - start, 0), duration)
     v_c(x) = (p(t + dt) - p(t))/dt + (R(t + dt) R(t)^T - I)/dt (x - p(t))
@@ -62,6 +62,7 @@ class MeshCollider(base.AbstractBoundary):
     angular_velocity: base.Vector = (0.0, 0.0, 0.0)  # about `position`, which travels along [rad/s]
     start: float = 0.0  # before the first frame: it is under way then [s]
     duration: Lasting = math.inf  # [s]
+    end: Lasting = math.inf  # when it is gone [s]
     kind: Kind = "sticky"
     friction: NotNegative = 0.0  # Coulomb coefficient, for slip and separate
 
@@ -108,7 +109,8 @@ class MeshCollider(base.AbstractBoundary):
         return torch.cat([torch.tensor(head, dtype=torch.float64), samples.to(torch.float64)])
 
     def signals(self, t: float, dt: float) -> tuple[float, ...]:
-        """p (3) [m], R (9), and of the velocity v_c: (p(t + dt) - p)/dt (3) [m/s], (R(t + dt) R^T - I)/dt (9) [1/s]"""
+        """p (3) [m], R (9), and of the velocity v_c: (p(t + dt) - p)/dt (3) [m/s], (R(t + dt) R^T - I)/dt (9) [1/s];
+        1 while it is there"""
         axis = np.array(self.angular_velocity)
         now = min(max(t - self.start, 0.0), self.duration)
         share = base.overlap(self.start, self.duration, t, dt)
@@ -119,7 +121,7 @@ class MeshCollider(base.AbstractBoundary):
             gradient = share * _cross(axis)
         velocity = np.array(self.velocity)
         place = np.array(self.position) + now * velocity
-        return (*place, *_turn(now * axis).flat, *(share * velocity), *gradient.flat)
+        return (*place, *_turn(now * axis).flat, *(share * velocity), *gradient.flat, float(t < self.end))
 
     def behind(self, setting: base.Setting) -> Float[Tensor, " p"]:
         vertices, triangles = self._mesh()
@@ -222,7 +224,7 @@ def _turn(w: np.ndarray) -> np.ndarray:
 @functools.cache
 def _field(real: type) -> tuple[wp.Function, wp.Function]:
     """Warp functions matrix_at(clock, row, b), and field(x, q, a, clock, row, b): the gradient of phi and phi [m] at x;
-    (0, 0, 0) and infinity away from the samples."""
+    (0, 0, 0) and infinity away from the samples, and where the mesh is gone."""
     vec3, vec4, mat33 = vector(real), vector4(real), matrix(real)
 
     @wp.func
@@ -249,7 +251,8 @@ def _field(real: type) -> tuple[wp.Function, wp.Function]:
         c = q[a + 3] * (wp.transpose(R) * r - vec3(q[a], q[a + 1], q[a + 2]))  # place among the samples
         i, j, k = int(wp.floor(c[0])), int(wp.floor(c[1])), int(wp.floor(c[2]))
         if (
-            i >= 0 and j >= 0 and k >= 0
+            clock[row, b + 24] > real(0.0)
+            and i >= 0 and j >= 0 and k >= 0
             and i < int(q[a + 4]) - 1 and j < int(q[a + 5]) - 1 and k < int(q[a + 6]) - 1
         ):  # fmt: skip
             s = c - vec3(real(i), real(j), real(k))
