@@ -31,8 +31,7 @@ def carry(
     which, near = embedding.which.to(x.device), embedding.neighbours.to(x.device)
     w = embedding.weights.to(x)
     mean, covariance = gaussians.mean.to(x), gaussians.covariance().to(x)
-    F_near = F[near]
-    F_g = torch.einsum("gk,gkij->gij", w, F_near)
+    F_near, F_g = F[near], deformation(embedding, F)
     way = mean[which, None] - X.to(x)[near]
     moved = torch.einsum("gk,gki->gi", w, x[near] + 0.5 * torch.einsum("gkij,gkj->gki", F_near + F_g[:, None], way))
     rotation = None
@@ -40,6 +39,11 @@ def carry(
         rotation = torch.eye(3).to(x).expand(len(mean), 3, 3).index_copy(0, which, _Rotation.apply(F_g))
     turned = F_g @ covariance[which] @ F_g.mT
     return mean.index_copy(0, which, moved), covariance.index_copy(0, which, turned), rotation
+
+
+def deformation(embedding: Embedding, F: Float[Tensor, "p 3 3"]) -> Float[Tensor, "g 3 3"]:
+    """F_g of the Gaussians `embedding.which`; that of the others, which stay as they are, is the identity."""
+    return torch.einsum("gk,gkij->gij", embedding.weights.to(F), F[embedding.neighbours.to(F.device)])
 
 
 class _Rotation(torch.autograd.Function):

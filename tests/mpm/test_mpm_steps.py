@@ -112,7 +112,7 @@ def switching(k_d: float) -> tuple[Tensor, Tensor, Tensor, Callable[[], Tensor]]
     first.v_gathered.copy_(spreading(position))
     first.L_gathered.copy_(torch.diag(torch.tensor(A)).expand(n, 3, 3))
     substeps = Substeps(arrays, hooks, material.advance(wp.float64))
-    substeps.start(np.array([[0.0, 1.0]]), 0, 0)
+    substeps.start(np.array([[0.0, 1.0, 0.0]]), 0, 0)
     implicit = ImplicitSubsteps(substeps, bounded=False)
     lengths = [1e-3] * 20 + [1 / 30] * 3 + [1e-3] * 20 + [1 / 30] * 2
     velocities = []
