@@ -68,6 +68,8 @@ class Learn:
             raise ValueError(
                 f"capture {capture.name} has no take with role learn; leave out the learning, or record a motion"
             )
+        if take.excitation is None:
+            raise ValueError(f"take {take.name}: nobody knows what set it in motion, and a start is not learned yet")
         start = self.world.estimate()
         indices = self.indices(take)
         seconds = int(indices[-1]) / take.fps
@@ -165,7 +167,7 @@ class Learn:
                 rest,
                 volume,
                 velocity=field.velocity(theta),
-                excitation=(*body.held(self.world.boundaries), *take.excitation),
+                excitation=(*body.held(self.world.boundaries), *(take.excitation or ())),
                 frames=len(indices),
                 frame_dt=int(indices[1]) / take.fps,
                 device=self.device,
