@@ -6,10 +6,11 @@ DATA ?=
 ARGS ?=
 PORT ?= 5000
 PYTHON ?= python3
+export REAL PRED OUT # they travel to the recipes in the environment, as they are
 
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup run ui view test bench lint clean
+.PHONY: help setup run score twin ui view test bench lint clean
 py := .venv/bin/python
 # torch's own threads spin beside those of the renderer and the simulator: OMP_NUM_THREADS=1 unless you say otherwise
 ready := .venv/.ready
@@ -37,6 +38,12 @@ $(ready): pyproject.toml constraints.txt
 
 run: $(ready) ## the pipeline on SCENE; what has been computed before is reused
 	@OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(py) -m pipeline scene=$(SCENE) profile=$(PROFILE) method=$(METHOD) $(if $(DATA),data=$(DATA)) $(ARGS)
+
+score: $(ready) ## any two videos compared: REAL=<clip> PRED=<clip> [OUT=<folder>]
+	@OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(py) -m pipeline.score
+
+twin: $(ready) ## a thing with known material as photographs and clips on disk: OUT=<new folder>
+	@OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(py) -m pipeline.twin
 
 ui: $(ready) ## MLflow: prints the address of the page that compares runs, and serves it
 	@PORT=$(PORT) $(py) -m pipeline.tracking .

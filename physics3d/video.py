@@ -78,6 +78,17 @@ def read_mp4(path: Path) -> tuple[UInt8[Tensor, "t h w 3"], float]:
     return torch.from_numpy(frames), fps
 
 
+def reduced(frames: UInt8[Tensor, "t h w 3"], height: int, width: int) -> UInt8[Tensor, "t height width 3"]:
+    """Frames with fewer pixels, each the mean of what it covers."""
+    if tuple(frames.shape[1:3]) == (height, width):
+        return frames.contiguous()
+    parts = [
+        torch.nn.functional.interpolate(part.permute(0, 3, 1, 2).float(), (height, width), mode="area")
+        for part in frames.split(16)
+    ]
+    return (torch.cat(parts).permute(0, 2, 3, 1) + 0.5).to(torch.uint8).contiguous()
+
+
 def contact_sheet(frames: UInt8[Tensor, "t h w 3"], *, columns: int = 6, count: int = 12) -> UInt8[Tensor, "H W 3"]:
     """`count` frames evenly spaced in time, laid out in a grid: a video one can look at as a picture."""
     count = min(count, len(frames))

@@ -12,9 +12,10 @@ from torch import Tensor
 from physics3d.boundaries.base import AbstractBoundary
 from physics3d.log import Log
 from physics3d.metrics.against import Reference
+from physics3d.metrics.pictures import busiest, slices
 from physics3d.metrics.scores import Scores
 from physics3d.scenes.base import Capture, Take
-from physics3d.video import Video, contact_sheet, space_time_slice, write_mp4
+from physics3d.video import Video, contact_sheet, reduced, write_mp4
 from physics3d.world import Estimate
 from stages.simulate import excited
 
@@ -134,11 +135,7 @@ def shrink(reference: Tensor, clips: dict[str, list[Tensor]], index: int, count:
             f"videos of {[f'{w} x {h}' for h, w in sizes]} px cannot be compared with a reference of {own[1]} x "
             f"{own[0]} px; render all at one scale <= 1 with the reference's camera"
         )
-    if (h, w) == own:
-        return reference[:count].contiguous()
-    frames = reference[:count].permute(0, 3, 1, 2).float()
-    small = torch.nn.functional.interpolate(frames, (h, w), mode="area").permute(0, 2, 3, 1)
-    return (small + 0.5).to(torch.uint8).contiguous()
+    return reduced(reference[:count], h, w)
 
 
 def parameter_errors(estimates: dict[str, Estimate], truth: dict[str, float]) -> dict[str, dict[str, float | None]]:
@@ -166,28 +163,8 @@ def previews(rows: dict[str, list[Tensor]], fps: float, scores: Scores, log: Log
         suffix = f"_{camera}" if len(rows[REFERENCE]) > 1 else ""
         write_mp4(log.path(f"previews/side_by_side{suffix}.mp4"), torch.cat(clips, 2), fps)
         log.image(f"frames{suffix}", contact_sheet(torch.cat(clips, 1), columns=8, count=8))  # one row per video
-        moved = (rows[REFERENCE][camera].float() - rows[REFERENCE][camera][0].float()).abs().sum((0, 3))
-        row, column = int(moved.sum(1).argmax()), int(moved.sum(0).argmax())
-        log.image(f"slices{suffix}", slices(shown, clips, row, column))
+        log.image(f"slices{suffix}", slices(shown, clips, *busiest(rows[REFERENCE][camera])))
     log.image("bars", bars(scores))
-
-
-def slices(names: list[str], clips: list[Tensor], row: int, column: int):
-    """A figure: the row and the column of pixels with most motion in the reference, against time."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(3 * len(names), 5.2), layout="constrained")
-    for i, (name, clip) in enumerate(zip(names, clips)):
-        for k, (picture, what) in enumerate(
-            (
-                (space_time_slice(clip, row=row), f"row {row}: time down"),
-                (space_time_slice(clip, column=column), f"column {column}: time right"),
-            )
-        ):
-            axis = figure.add_subplot(2, len(names), 1 + i + k * len(names))
-            axis.imshow(picture.numpy(), aspect="auto", interpolation="nearest")
-            axis.set(title=f"{name}\n{what}" if k == 0 else what, xticks=[], yticks=[])
-    return figure
 
 
 def bars(scores: Scores):

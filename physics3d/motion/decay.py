@@ -135,17 +135,40 @@ def _basis(t: np.ndarray, poles: np.ndarray) -> np.ndarray:
     return np.stack(columns, 1)
 
 
-def _projected(s: np.ndarray, t: np.ndarray, poles: np.ndarray) -> np.ndarray:
-    q, _ = np.linalg.qr(_basis(t, poles))
-    return s - q @ (q.T @ s)
-
-
 def _misfit(s: np.ndarray, t: np.ndarray, poles: np.ndarray) -> float:
-    return float((_projected(s, t, poles) ** 2).sum())
+    q, _ = np.linalg.qr(_basis(t, poles))
+    return float((s**2).sum() - ((q.T @ s) ** 2).sum())
+
+
+def _jacobian(s: np.ndarray, t: np.ndarray, poles: np.ndarray) -> np.ndarray:
+    """d residual/d (f of the oscillations, then d) [n k, m] by -P dB/dp B^+ s (Kaufman 1975)."""
+    basis = _basis(t, poles)
+    q, r = np.linalg.qr(basis)
+    linear = np.linalg.lstsq(r, q.T @ s, rcond=None)[0]
+    by_f, by_d, column = [], [], 1
+    for f, _ in poles:
+        if f > 0:
+            a, b = linear[column], linear[column + 1]
+            cosine, sine = basis[:, column, None], basis[:, column + 1, None]
+            by_f.append(2 * np.pi * t[:, None] * (cosine * b - sine * a))
+            by_d.append(-t[:, None] * (cosine * a + sine * b))
+            column += 2
+        else:
+            by_d.append(-t[:, None] * basis[:, column, None] * linear[column])
+            column += 1
+    change = np.stack(by_f + by_d, -1).reshape(len(t), -1)
+    return -(change - q @ (q.T @ change)).reshape(s.size, -1)
+
+
+def _unpacked(x: np.ndarray, swings: np.ndarray) -> np.ndarray:
+    """(f of the oscillations, then d) -> poles [j, 2]; a relaxation stays one."""
+    f = np.zeros(len(swings))
+    f[swings] = x[: swings.sum()]
+    return np.stack([f, x[swings.sum() :]], 1)
 
 
 def _refined(s: np.ndarray, t: np.ndarray, poles: np.ndarray) -> np.ndarray:
-    """f, d by variable projection from `poles`; a relaxation stays one."""
+    """f, d by variable projection from `poles`."""
     from scipy.optimize import least_squares
 
     swings, duration = poles[:, 0] > 0, float(t[-1])
@@ -153,15 +176,15 @@ def _refined(s: np.ndarray, t: np.ndarray, poles: np.ndarray) -> np.ndarray:
     upper = np.concatenate([np.full(swings.sum(), 0.48 / t[1]), np.full(len(poles), 1.2 * FASTEST)])
     start = np.clip(np.concatenate([poles[swings, 0], poles[:, 1]]), lower + 1e-9, upper - 1e-9)
 
-    def unpacked(x):
-        f = np.zeros(len(poles))
-        f[swings] = x[: swings.sum()]
-        return np.stack([f, x[swings.sum() :]], 1)
+    def residual(x):
+        q, _ = np.linalg.qr(_basis(t, _unpacked(x, swings)))
+        return (s - q @ (q.T @ s)).ravel()
 
-    done = least_squares(
-        lambda x: _projected(s, t, unpacked(x)).ravel(), start, bounds=(lower, upper), x_scale=1 / duration, max_nfev=60
-    )
-    return unpacked(done.x)
+    def jacobian(x):
+        return _jacobian(s, t, _unpacked(x, swings))
+
+    done = least_squares(residual, start, jacobian, bounds=(lower, upper), x_scale=1 / duration, max_nfev=60)
+    return _unpacked(done.x, swings)
 
 
 def _solved(s: np.ndarray, t: np.ndarray, poles: np.ndarray, fps: float, first: int) -> Decay:
@@ -201,22 +224,12 @@ def _solved(s: np.ndarray, t: np.ndarray, poles: np.ndarray, fps: float, first: 
 
 
 def _pole_errors(s: np.ndarray, t: np.ndarray, poles: np.ndarray, noise: float) -> np.ndarray:
-    """Standard errors of f and d [j, 2] from the Jacobian of the projected residual, by central differences."""
-    columns, which = [], []
-    for j, (f, _) in enumerate(poles):
-        for side in (0, 1) if f > 0 else (1,):
-            step = np.zeros_like(poles)
-            step[j, side] = 1e-4 / t[-1]
-            difference = _projected(s, t, poles + step) - _projected(s, t, poles - step)
-            columns.append(difference.ravel() / (2e-4 / t[-1]))
-            which.append((j, side))
-    errors = np.zeros_like(poles)
-    if columns:
-        jacobian = np.stack(columns, 1)
-        covariance = noise * np.linalg.pinv(jacobian.T @ jacobian)
-        for (j, side), value in zip(which, np.diag(covariance)):
-            errors[j, side] = math.sqrt(max(value, 0.0))
-    return errors
+    """Standard errors of f and d [j, 2], for errors of variance `noise`."""
+    if not len(poles):
+        return np.zeros((0, 2))
+    jacobian = _jacobian(s, t, poles)
+    covariance = noise * np.linalg.pinv(jacobian.T @ jacobian)
+    return _unpacked(np.sqrt(np.maximum(np.diag(covariance), 0)), poles[:, 0] > 0)
 
 
 def _information(decay: Decay, s: np.ndarray) -> float:

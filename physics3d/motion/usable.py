@@ -22,6 +22,7 @@ from physics3d.motion.decay import Decay
 from physics3d.motion.flow import flow, greys, trust
 from physics3d.motion.release import free_decay
 from physics3d.motion.shapes import moving, shapes
+from physics3d.video import reduced
 
 SIDE = 320  # [px]
 CUT = 12.0  # grey levels
@@ -57,7 +58,7 @@ def check_clip(clip: Clip, *, box: tuple[float, float, float, float] | None = No
     if len(clip.frames) < 8:
         raise ValueError(f"{name}: {len(clip.frames)} frames; a motion needs at least 8, better two seconds")
     factor = min(1.0, SIDE / max(clip.frames.shape[1:3]))
-    small = reduced(clip.frames, factor)
+    small = reduced(clip.frames, *scaled(clip.frames, factor))
     cut = cut_at(small)
     if cut is not None:
         raise ValueError(
@@ -101,21 +102,15 @@ def check_clip(clip: Clip, *, box: tuple[float, float, float, float] | None = No
     )
 
 
-def reduced(frames: Tensor, factor: float) -> Tensor:
-    """Box average."""
-    if factor == 1:
-        return frames
-    size = [max(8, round(n * factor)) for n in frames.shape[1:3]]
-    chunks = [
-        torch.nn.functional.interpolate(part.permute(0, 3, 1, 2).float(), size, mode="area")
-        for part in frames.split(16)
-    ]
-    return (torch.cat(chunks).permute(0, 2, 3, 1) + 0.5).to(torch.uint8)
+def scaled(frames: Tensor, factor: float) -> tuple[int, int]:
+    """(height, width) of frames times `factor`, at least 8 px."""
+    h, w = frames.shape[1:3]
+    return max(8, round(h * factor)), max(8, round(w * factor))
 
 
 def cut_at(frames: Tensor) -> int | None:
     """The first frame after a cut."""
-    tiny = greys(reduced(frames, 32 / max(frames.shape[1:3]))).astype(float)
+    tiny = greys(reduced(frames, *scaled(frames, 32 / max(frames.shape[1:3])))).astype(float)
     jumps = np.abs(np.diff(tiny, axis=0)).mean((1, 2))
     worst = int(jumps.argmax())
     return worst + 1 if jumps[worst] > max(CUT, 6 * float(np.median(jumps))) else None
