@@ -94,8 +94,7 @@ def test_the_release_is_where_a_hand_lets_go(held, rng):
     steps = np.cumsum(rng.normal(size=(frames + 1, 3)), 0)[::-1]
     hand = free[0] + steps[:frames] - steps[-1] if frames else free[:0]
     decay, release = free_decay(np.concatenate([hand, free]), FPS)
-    step = (frames + FRAMES) / 20  # first frames are tried at that distance
-    assert frames - 1 <= release <= frames + step
+    assert abs(release - frames) <= 2  # a frame or two of the hand may look like the decay
     assert decay.frequency[nearest(decay, 2.3)] == pytest.approx(2.3, abs=0.03)
 
 
