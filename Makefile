@@ -57,7 +57,7 @@ view: ## the video and previews of the last run
 test: $(ready) ## everything that needs no GPU and no weights
 	@OMP_NUM_THREADS=1 $(py) -m pytest -n 2 --dist loadfile $(ARGS)
 
-bench: $(ready) bench-speed bench-renderer bench-filling bench-embedding bench-simulation bench-stability bench-segmentation bench-reconstruction ## measurements with plots, into docs/results; one alone: make bench-<name>
+bench: $(ready) bench-speed bench-renderer bench-filling bench-embedding bench-simulation bench-stability bench-segmentation bench-reconstruction bench-motion ## measurements with plots, into docs/results; one alone: make bench-<name>
 
 bench-%: $(ready)
 	@OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(py) benchmarks/$*.py $(ARGS)
