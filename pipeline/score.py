@@ -54,11 +54,12 @@ def score(real: Path, predicted: Path, folder: Path) -> None:
     half = Reference(pair.real[seen:], pair.fps)
     notes = {str(i + 1): note for i, note in enumerate(pair.notes)}
     clips = {"prediction": pair.predicted[seen:], **stills(pair.real, seen=seen)}
-    tables = []
-    for title, reference, rows in (("second half", half, clips), ("whole clip", whole, {"prediction": pair.predicted})):
-        values = {"real": plain(reference.itself()[0], title, notes)}
-        values |= {name: plain(reference.measure(clip)[0], title, notes) for name, clip in rows.items()}
-        tables.append((title, Scores(values=values)))
+    second = {"real": half.itself()[0]} | {name: half.measure(clip)[0] for name, clip in clips.items()}
+    all_of_it = {"real": whole.itself()[0], "prediction": whole.motion(pair.predicted)[0]}
+    tables = [
+        (title, Scores(values={name: plain(cells, title, notes) for name, cells in rows.items()}))
+        for title, rows in (("second half", second), ("motion over the whole clip", all_of_it))
+    ]
 
     log = Log(folder, quiet=True)
     done = log.path("score.md")
@@ -82,8 +83,8 @@ def score(real: Path, predicted: Path, folder: Path) -> None:
     }
     log.image("curves", curves(per_frame, pair.fps, first=seen))
     log.image("slices", slices(["real", "prediction"], [pair.real, pair.predicted], *busiest(pair.real)))
-    rows = [pair.real, pair.predicted, 255 - (pair.real.int() - pair.predicted.int()).abs().to(pair.real.dtype)]
-    log.image("frames", contact_sheet(torch.cat(rows, 1), columns=8, count=8))
+    strips = [pair.real, pair.predicted, 255 - (pair.real.int() - pair.predicted.int()).abs().to(pair.real.dtype)]
+    log.image("frames", contact_sheet(torch.cat(strips, 1), columns=8, count=8))
     pictures = (("frames", "real, prediction, difference"), ("curves", "per frame"), ("slices", "space-time slices"))
     text += ["", *(f"![{what}](previews/{name}.png)" for name, what in pictures)]
     done.write_text("\n".join(text) + "\n")

@@ -24,7 +24,7 @@ def texture(x: np.ndarray, y: np.ndarray, seed: int) -> np.ndarray:
     for _ in range(24):
         k, angle, phase = 2 * math.pi / rng.uniform(6, 25), rng.uniform(0, math.pi), rng.uniform(0, 2 * math.pi)
         total += np.sin(k * (np.cos(angle) * x + np.sin(angle) * y) + phase)
-    return 0.5 + total / 24
+    return np.clip(0.5 + total / 24, 0, 1)
 
 
 def swaying(

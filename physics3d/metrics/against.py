@@ -33,7 +33,12 @@ class Reference:
         """Every measure, and why the clip has no oscillation if so. Raises ValueError for unequal shapes."""
         cells: Cells = {"psnr": (psnr(clip, self.clip), ""), "ssim": (ssim(clip, self.clip), "")}
         cells |= {"ms_ssim": ms_ssim(clip, self.clip), "vmaf": vmaf(clip, self.clip)}
-        cells["motion_psnr"] = motion_psnr(clip, self.clip)
+        motion, why = self.motion(clip)
+        return cells | motion, why
+
+    def motion(self, clip: UInt8[Tensor, "t h w 3"]) -> tuple[Cells, str]:
+        """The measures of the motion alone."""
+        cells: Cells = {"motion_psnr": motion_psnr(clip, self.clip)}
         if self.where is None:
             return cells | {"flow_error": (None, STILL)} | self._cells(None, STILL), ""
         u = flow(clip)

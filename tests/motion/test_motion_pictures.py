@@ -47,7 +47,7 @@ def test_a_carried_picture_is_the_picture_taken_at_displaced_places():
     y, x = np.mgrid[:H, :W].astype(float)
     u = np.stack([3 * np.sin(y / 15), 2 * np.cos(x / 20)], -1).astype(np.float32)
     v = inverse(u)
-    picture = np.repeat((255 * texture(x, y, 3))[..., None], 3, 2).astype(np.uint8)
+    picture = np.repeat((255 * texture(x, y, 3) + 0.5)[..., None], 3, 2).astype(np.uint8)
     # the texture is known everywhere, so the carried picture is too: T(y + v(y))
     truth = 255 * texture(x + v[..., 0], y + v[..., 1], 3)
     inner = np.s_[8:-8, 8:-8]
