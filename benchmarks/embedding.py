@@ -6,7 +6,7 @@ A soft bar (0.1 x 0.1 x 0.3 m, neo-Hookean, E = 20 kPa, cells of 25 mm) is held 
 (twist, about a quarter turn at its head), or is poked. It is made of 12 288 Gaussians, 64 in a cell. Reference: every
 Gaussian is a particle. Against it: particles on a lattice, 1, 8, 27 or 64 in a cell of the same grid ("simulated"), or
 1 or 8 of the reference's own particles in a cell ("map alone": no other simulation, only the map). They carry the
-Gaussians by the map of `gaussians/deform.py` (third order), or by the plain mean of their affine motions,
+Gaussians by the map of `gaussians/carry.py` (third order), or by the plain mean of their affine motions,
 x_g = sum_j w_j (x_j + F_j (X_g - X_j)). Positions are compared relative to the displacement (rms over Gaussians and
 frames), covariances relative to their own norm, pictures by PSNR over frames.
 """
@@ -30,9 +30,12 @@ from benchmarks.machine import machine
 from physics3d.boundaries.base import AbstractBoundary
 from physics3d.boundaries.fixed_region import FixedRegion
 from physics3d.boundaries.impulse import Impulse
-from physics3d.filling.fill import Poisson, fill
+from physics3d.filling.fill import fill
+from physics3d.filling.solids import Poisson
 from physics3d.gaussians.cameras import Camera, look_at
-from physics3d.gaussians.deform import Embedding, carry, embed, render_deformed
+from physics3d.gaussians.carry import carry
+from physics3d.gaussians.deform import render_deformed
+from physics3d.gaussians.embedding import Embedding, embed
 from physics3d.gaussians.interior import Interior, paint
 from physics3d.gaussians.model import Gaussians
 from physics3d.gaussians.rasterize import rasterize
@@ -40,7 +43,8 @@ from physics3d.gaussians.render import render
 from physics3d.gaussians.sh import C0, sh_color
 from physics3d.log import Log
 from physics3d.materials.neo_hookean import NeoHookean
-from physics3d.mpm.rollout import Trajectory, rollout
+from physics3d.mpm.rollout import rollout
+from physics3d.trajectory import Trajectory
 from physics3d.world import World
 
 RESULTS = Path(__file__).parents[1] / "docs/results"

@@ -31,7 +31,10 @@ from analytic_bodies import annulus, box, cup, discs, petal, sphere, together, t
 from labelled_twins import carnation
 
 from benchmarks.machine import machine
-from physics3d.filling.fill import AbstractSolid, Body, Poisson, Surface, WindingNumber, fill, sample_surface
+from physics3d.filling.body import Body
+from physics3d.filling.fill import fill
+from physics3d.filling.solids import AbstractSolid, Poisson, WindingNumber
+from physics3d.filling.surface import Surface, sample_surface
 from physics3d.gaussians.model import Gaussians
 from physics3d.log import Log
 from physics3d.scenes.flower import STEM_TOP, plant, stem_curve

@@ -20,7 +20,8 @@ from physics3d.boundaries.base import AbstractBoundary, Setting, inside_box
 from physics3d.boundaries.bounding_box import BoundingBox
 from physics3d.boundaries.fixed_region import FixedRegion
 from physics3d.boundaries.half_space import HalfSpace
-from physics3d.gaussians.deform import carry, embed
+from physics3d.gaussians.carry import carry
+from physics3d.gaussians.embedding import embed
 from physics3d.gaussians.model import Gaussians
 from physics3d.log import Log
 from physics3d.materials.drucker_prager import DruckerPrager
@@ -28,7 +29,8 @@ from physics3d.materials.neo_hookean import NeoHookean
 from physics3d.materials.newtonian import Newtonian
 from physics3d.materials.viscoelastic import Viscoelastic
 from physics3d.materials.von_mises import VonMises
-from physics3d.mpm.rollout import Trajectory, rollout
+from physics3d.mpm.rollout import rollout
+from physics3d.trajectory import Trajectory
 from physics3d.warp_types import matrix, vector
 from physics3d.world import World
 
@@ -175,7 +177,7 @@ def bar(cells: int, branches: int, seconds: float = 2.0, **changes) -> Answer:
     if branches:
         start |= dict(
             branch_shear_modulus=MU_N, branch_bulk_modulus=K_N,
-            shear_viscosity_time=1 / K_D, bulk_viscosity_time=1 / K_V,
+            shear_relaxation_time=1 / K_D, bulk_relaxation_time=1 / K_V,
         )  # fmt: skip
     walls = (_thin(dx, "yz"), HalfSpace(point=(0.0, 0.0, 0.0), normal=(1.0, 0.0, 0.0), kind="sticky"))
     world = _world(dx, changes, material=Viscoelastic(branches=branches), start=start, boundaries=walls)

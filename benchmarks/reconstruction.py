@@ -18,8 +18,9 @@ from pathlib import Path
 import torch
 from machine import machine
 
-from physics3d.gaussians.densify import Adaptive, Relocation
-from physics3d.gaussians.fit import held_out_psnr
+from physics3d.gaussians.densification.adaptive import Adaptive
+from physics3d.gaussians.densification.relocation import Relocation
+from physics3d.gaussians.loss import held_out_psnr
 from physics3d.log import Log
 from physics3d.scenes.base import Capture
 from pipeline.settings import compose
@@ -28,7 +29,6 @@ from stages.reconstruct import Reconstruct
 
 RESULTS = Path(__file__).resolve().parent.parent / "docs" / "results"
 SCENES = ("lego", "plush", "carnation")
-TARGETS = {"lego": 30.0, "plush": 24.0}  # held out, two cores, ten minutes [dB]
 # name -> part of the configured iterations, of the Gaussians, of the resolution
 BUDGETS = {"small": (0.12, 0.3, 0.5), "medium": (0.35, 0.6, 0.75), "as configured": (1.0, 1.0, 1.0)}
 WAYS = {"adaptive": Adaptive(), "MCMC": Relocation()}
@@ -146,9 +146,6 @@ def write(rows: list[dict], left_out: list[str], device: str, seed: int) -> None
         whole = [r for r in rows if r["scene"] == scene and r["budget"] == "as configured" and not r["final"]]
         if whole:
             axis.plot([r["seconds"] for r in whole], [r["psnr_db"] for r in whole], ":", label="during the largest")
-        if scene in TARGETS:
-            axis.axhline(TARGETS[scene], color="0.6", linewidth=0.8)
-            axis.annotate("target", (0.02, TARGETS[scene]), xycoords=("axes fraction", "data"), fontsize=8, va="bottom")
         axis.set(xscale="log", xlabel="time [s]", ylabel="PSNR of photographs held out [dB]", title=scene)
         axis.grid(alpha=0.3)
         axis.legend(fontsize=8)
@@ -165,7 +162,7 @@ def page(final: list[dict], left_out: list[str], title: str) -> str:
         "",
         "PSNR [dB] of photographs that were held out, all at the largest resolution of their scene. The largest",
         "budget is the scene's configuration, the others are parts of it. `adaptive` splits what draws the most",
-        "error, `MCMC` moves faded Gaussians to where opaque ones are (`physics3d/gaussians/densify.py`). The last",
+        "error, `MCMC` moves faded Gaussians to where opaque ones are (`physics3d/gaussians/densification/`). The last",
         "column is the change of PSNR by the removal of floaters, which is part of every row that has one.",
         "",
         "![PSNR against time](reconstruction.png)",
@@ -181,15 +178,11 @@ def page(final: list[dict], left_out: list[str], title: str) -> str:
             f"{r['psnr_db']:.2f} | {r['seconds']:.0f} | {r['cpu_seconds']:.0f} | {floaters[0]} | {floaters[1]} |"
         )
     lines += [""]
-    for scene, target in TARGETS.items():
+    for scene in SCENES:
         mine = [r for r in final if r["scene"] == scene]
         if mine:
             best = max(mine, key=lambda r: r["psnr_db"])
-            verdict = "met" if best["psnr_db"] >= target and best["seconds"] < 600 else "missed"
-            lines.append(
-                f"- {scene}: target {target:g} dB in ten minutes on two cores {verdict}: {best['psnr_db']:.2f} dB in "
-                f"{best['seconds']:.0f} s."
-            )
+            lines.append(f"- {scene}: at best {best['psnr_db']:.2f} dB, in {best['seconds']:.0f} s.")
     lines += [f"- {scene}: not measured, its data was not there." for scene in left_out]
     return "\n".join(lines) + "\n"
 

@@ -21,7 +21,7 @@ from machine import machine
 
 from physics3d.gaussians.cameras import Camera, look_at
 from physics3d.gaussians.rasterize import rasterize
-from physics3d.gaussians.splatting import Numerics
+from physics3d.gaussians.splat import Numerics
 from physics3d.gaussians.twin import rasterize_plainly
 from physics3d.gaussians.with_gsplat import rasterize_with_gsplat
 

@@ -43,7 +43,7 @@ MATERIALS = {
 }
 START = {
     "youngs_modulus": 1e5, "poissons_ratio": 0.3, "branch_shear_modulus": 2e4, "branch_bulk_modulus": 4e4,
-    "shear_viscosity_time": 0.1, "bulk_viscosity_time": 0.1,
+    "shear_relaxation_time": 0.1, "bulk_relaxation_time": 0.1,
 }  # fmt: skip
 PER_SUBSTEP = "ns per particle and substep"
 

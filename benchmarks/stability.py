@@ -49,7 +49,7 @@ from physics3d.materials.viscoelastic import Viscoelastic
 from physics3d.materials.von_mises import VonMises
 from physics3d.materials.with_branches import WithBranches
 from physics3d.mpm.rollout import rollout
-from physics3d.mpm.transfer import velocity_gradient
+from physics3d.mpm.velocity_gradient import velocity_gradient
 from physics3d.world import World
 
 RESULTS = Path(__file__).resolve().parent.parent / "docs" / "results"
@@ -282,10 +282,10 @@ def cases(seed: int) -> list[tuple[str, str, dict]]:
     ]
     found += [("Poisson's ratio", f"{nu:g}", jelly(start=elastic(1e5, nu))) for nu in (0, 0.45, 0.499, 0.4999, 0.5)]
     for time in (1e-30, 1e-9, 1e-3, 1e9, math.inf):
-        start = branch | dict(shear_viscosity_time=time, bulk_viscosity_time=time)
+        start = branch | dict(shear_relaxation_time=time, bulk_relaxation_time=time)
         found.append(("relaxation time [s]", f"{time:g}", jelly(material=Viscoelastic(), start=start)))
     for viscosity in (0.0, 1.0, 1e3, 1e6, 1e12):
-        time = dict(shear_viscosity_time=viscosity / branch["branch_shear_modulus"], bulk_viscosity_time=math.inf)
+        time = dict(shear_relaxation_time=viscosity / branch["branch_shear_modulus"], bulk_relaxation_time=math.inf)
         found.append(
             ("viscosity of a branch [Pa s]", f"{viscosity:g}", jelly(material=Viscoelastic(), start=branch | time))
         )

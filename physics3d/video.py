@@ -1,5 +1,11 @@
-"""Videos: uint8 frames [t, h, w, 3], written and read as mp4 by the ffmpeg that imageio-ffmpeg brings."""
+"""Videos: uint8 frames [t, h, w, 3], written and read as mp4 by the ffmpeg that imageio-ffmpeg brings.
 
+ffmpeg is called here, not through imageio, which looks at neither its exit status nor its messages: a full disk would
+leave half a video that nobody is told of.
+"""
+
+import shutil
+import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,52 +36,90 @@ class Video(AbstractArtifact):
             raise ValueError(f"Video.fps is {self.fps}; it must be positive")
 
 
-def to_uint8(image: Tensor) -> Tensor:
-    """Float colour in 0..1 -> uint8, rounding to nearest."""
-    return (image.detach().clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu()
-
-
 def ffmpeg() -> str:
     """Path of the ffmpeg program. Raises RuntimeError with the remedy if there is none."""
     try:
         import imageio_ffmpeg
 
-        return imageio_ffmpeg.get_ffmpeg_exe()
+        program = imageio_ffmpeg.get_ffmpeg_exe()
+        found = shutil.which(program)
+        if found is None:
+            raise RuntimeError(f"{program} is no program")
+        return found
     except (ImportError, RuntimeError) as error:
         raise RuntimeError(
-            "no ffmpeg found: run `make setup` (imageio-ffmpeg brings one) or set IMAGEIO_FFMPEG_EXE to yours"
+            f"no ffmpeg found ({' '.join(str(error).split())}); run `make setup` (imageio-ffmpeg brings one) or set "
+            "IMAGEIO_FFMPEG_EXE to yours"
         ) from error
 
 
-def write_mp4(path: Path, frames: UInt8[Tensor, "t h w 3"], fps: float) -> None:
-    """Encode frames as H.264; odd sizes lose their last row or column, because yuv420p has none."""
-    import imageio.v2 as imageio
+def run_ffmpeg(arguments: list[str], frames: bytes = b"", folder: Path | None = None) -> bytes:
+    """Call ffmpeg in `folder` with `frames` as its input -> its output. Raises RuntimeError with what it says."""
+    command = [ffmpeg(), "-hide_banner", "-loglevel", "error", *arguments]
+    done = subprocess.run(command, input=frames, capture_output=True, cwd=folder)
+    if done.returncode:
+        lines = done.stderr.decode(errors="replace").strip().splitlines() or ["it said nothing"]
+        full = next((line for line in lines if "No space left" in line), lines[-1])
+        raise RuntimeError(f"ffmpeg failed with status {done.returncode}: {full.strip()}")
+    return done.stdout
 
-    ffmpeg()
-    array = np.asarray(frames)
-    h, w = (array.shape[1] // 2) * 2, (array.shape[2] // 2) * 2
+
+def write_mp4(path: Path, frames: UInt8[Tensor, "t h w 3"], fps: float) -> None:
+    """Encode frames as H.264; odd sizes lose their last row or column, because yuv420p has none.
+
+    Raises ValueError for frames that make no video, RuntimeError if ffmpeg fails; then no file is left.
+    """
+    t, h, w = frames.shape[:3]
+    h, w = h // 2 * 2, w // 2 * 2
+    if not (t and h and w and 0 < fps < float("inf")):
+        raise ValueError(
+            f"{path.name}: {t} frames of {frames.shape[2]} x {frames.shape[1]} px at {fps:g} per second make no video; "
+            "at least 1 frame, 2 x 2 px and a positive rate are needed (a larger render.scale?)"
+        )
     path.parent.mkdir(parents=True, exist_ok=True)
-    with imageio.get_writer(
-        path, fps=fps, codec="libx264", quality=8, macro_block_size=2, ffmpeg_log_level="error"
-    ) as out:
-        for frame in array[:, :h, :w]:
-            out.append_data(frame)  # type: ignore[attr-defined]
+    target = str(path.absolute())  # no name is then an option or a protocol of ffmpeg
+    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{w}x{h}", "-r", f"{fps:.9g}", "-i", "-"]
+    coding = ["-an", "-c:v", "libx264", "-crf", "10", "-pix_fmt", "yuv420p", "-y", target]
+    try:
+        run_ffmpeg([*source, *coding], np.ascontiguousarray(np.asarray(frames)[:, :h, :w]).tobytes())
+        # some versions end with status 0 although the last blocks did not fit on the disk: count what arrived
+        told = run_ffmpeg(["-i", target, "-map", "0:v:0", "-c", "copy", "-f", "framecrc", "-"])
+        packets = sum(not line.startswith(b"#") for line in told.splitlines())
+        if packets != t:
+            raise RuntimeError(f"{path} holds {packets} of {t} frames; is the disk full?")
+    except BaseException:
+        path.unlink(missing_ok=True)
+        raise
 
 
 def read_mp4(path: Path) -> tuple[UInt8[Tensor, "t h w 3"], float]:
-    """Decode a video -> (frames, fps). Raises ValueError naming the file if it cannot be read."""
-    import imageio.v2 as imageio
+    """Decode a video, turned as it says -> (frames, fps). Raises ValueError naming the file if it cannot be read to its
+    end.
 
-    ffmpeg()
+    Frames are evenly spaced in time: those of a variable rate (telephones, browsers) are taken at their mean rate.
+    """
     if not path.is_file():
         raise ValueError(f"no video at {path}; check the path in the scene's configuration")
+    import imageio_ffmpeg
+
+    ffmpeg()
+    target = str(path.absolute())
     try:
-        with imageio.get_reader(path) as reader:
-            fps = float(reader.get_meta_data()["fps"])  # type: ignore[attr-defined]
-            frames = np.stack([np.asarray(frame) for frame in reader])  # type: ignore[attr-defined]
-    except Exception as error:
-        raise ValueError(f"cannot read the video {path}: {error}") from error
-    return torch.from_numpy(frames), fps
+        opened = imageio_ffmpeg.read_frames(target)
+        told = next(opened)
+        opened.close()
+        w, h = told["size"]
+        count, seconds = imageio_ffmpeg.count_frames_and_secs(target)
+        even = abs(told["fps"] * seconds - count) <= max(2, 0.05 * count)
+        fps = float(told["fps"]) if even else round(count / seconds, 3)
+        rate = ["-fps_mode", "passthrough"] if even else ["-vf", f"fps={fps}"]
+        decoded = run_ffmpeg(["-xerror", "-i", target, "-f", "rawvideo", "-pix_fmt", "rgb24", *rate, "-"])
+        array = np.frombuffer(bytearray(decoded), np.uint8).reshape(-1, h, w, 3)
+        if not len(array):
+            raise ValueError("it holds no frames")
+    except (OSError, RuntimeError, ValueError, StopIteration) as error:
+        raise ValueError(f"cannot read the video {path}: {' '.join(str(error).split())[:200]}") from error
+    return torch.from_numpy(array), fps
 
 
 def reduced(frames: UInt8[Tensor, "t h w 3"], height: int, width: int) -> UInt8[Tensor, "t height width 3"]:
@@ -87,22 +131,3 @@ def reduced(frames: UInt8[Tensor, "t h w 3"], height: int, width: int) -> UInt8[
         for part in frames.split(16)
     ]
     return (torch.cat(parts).permute(0, 2, 3, 1) + 0.5).to(torch.uint8).contiguous()
-
-
-def contact_sheet(frames: UInt8[Tensor, "t h w 3"], *, columns: int = 6, count: int = 12) -> UInt8[Tensor, "H W 3"]:
-    """`count` frames evenly spaced in time, laid out in a grid: a video one can look at as a picture."""
-    count = min(count, len(frames))
-    columns = min(columns, count)
-    picks = frames[torch.linspace(0, len(frames) - 1, count).round().long()]
-    rows = -(-count // columns)
-    t, h, w, _ = picks.shape
-    sheet = torch.full((rows * columns, h, w, 3), 255, dtype=torch.uint8)
-    sheet[:t] = picks
-    return sheet.reshape(rows, columns, h, w, 3).permute(0, 2, 1, 3, 4).reshape(rows * h, columns * w, 3)
-
-
-def space_time_slice(frames: UInt8[Tensor, "t h w 3"], *, row: int | None = None, column: int | None = None) -> Tensor:
-    """One line of pixels over time: uint8 [h, t, 3] for a column, [t, w, 3] for a row. Shows motion as a curve."""
-    if (row is None) == (column is None):
-        raise ValueError("space_time_slice needs exactly one of row and column")
-    return frames[:, row] if row is not None else frames[:, :, column].transpose(0, 1)

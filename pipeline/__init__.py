@@ -1,0 +1,1 @@
+"""Runs the stages: command line, configuration, stored results, Prefect, MLflow."""

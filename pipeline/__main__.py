@@ -2,21 +2,28 @@
 
 Composes the configuration, says "up to date" if everything has been filed, else runs the flow under Prefect, records
 it in MLflow, and prints what came out. Nothing heavy is imported before it is needed. Exit codes: 0 done, 1 a stage
-failed, 2 the command line is wrong, 130 Ctrl-C.
+failed, 2 the command line is wrong, 130 interrupted by Ctrl-C or SIGTERM.
 """
 
+import io
 import logging
 import os
+import shutil
+import signal
 import sys
+import tempfile
 import time
 import warnings
 from pathlib import Path
 from typing import Any
 
+from pipeline.fingerprint import installed
 from pipeline.flow import execute, up_to_date
 from pipeline.report import report
 from pipeline.settings import CONF, GROUPS, SettingsError, choices, compose, described
 from pipeline.stage import Filed, StageError
+from pipeline.tracking import Tracking, address, git_commit, mend
+from pipeline.words import literal_paths
 
 USAGE = """\
 python -m pipeline [group=name ...] [key=value ...]      e.g. python -m pipeline scene=carnation profile=smoke
@@ -31,13 +38,20 @@ Runs the pipeline on a scene; what has been computed before is reused. Keys are 
 """
 
 
+LEAST_SPACE = 10_000_000  # what Prefect and MLflow need for their databases [byte]
+
+
 def main(words: list[str]) -> int:
     started = time.monotonic()
     if "--help" in words or "-h" in words:
         print(usage())
         return 0
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a name that this terminal cannot show must not end a run
+            stream.reconfigure(errors="backslashreplace")
     try:
-        config, picked = compose([w for w in words if w != "--config"])
+        config, picked = compose(literal_paths([w for w in words if w != "--config"]))
         if "--config" in words:
             show(config)
             return 0
@@ -47,6 +61,8 @@ def main(words: list[str]) -> int:
     except StageError as error:
         return _fail(str(error), 1)
     except KeyboardInterrupt:
+        for name in (signal.SIGINT, signal.SIGTERM):  # once is enough; a second one ends what libraries do at the end
+            signal.signal(name, signal.SIG_DFL)
         print("\ninterrupted; finished stages are kept, the same command goes on from there", file=sys.stderr)
         return 130
     except Exception as error:
@@ -60,14 +76,17 @@ def run(config: dict[str, Any], picked: dict[str, str], started: float) -> int:
     output = Path(config["output"]).expanduser().resolve()
     shelf = output / "artifacts"
     verify = config["verify"]
+    mend(output)
     plan = up_to_date(config, shelf, verify)
     if plan is not None:
         report(plan, {step.name: True for step in plan.steps})
         print(f"up to date: all {len(plan.steps)} steps were computed before ({time.monotonic() - started:.1f} s)")
         return 0
 
-    from pipeline.tracking import Tracking, address, git_commit
-
+    output.mkdir(parents=True, exist_ok=True)
+    if _free(output) < LEAST_SPACE:  # the server would wait for its database, rather than end
+        raise StageError(_full(output))
+    _kernels(output)
     _quiet()
     hits: dict[str, bool] = {}
     tracking: Tracking | None = None
@@ -88,6 +107,10 @@ def run(config: dict[str, Any], picked: dict[str, str], started: float) -> int:
     except KeyboardInterrupt:
         status = "KILLED"
         raise
+    except Exception as error:
+        if isinstance(error, StageError) or _free(output) > 1 << 20:
+            raise
+        raise StageError(_full(output)) from error  # the server, or a library, says anything but that
     finally:
         if tracking is not None:
             tracking.close(scores=scores, status=status)
@@ -120,6 +143,35 @@ def show(config: dict[str, Any]) -> None:
     print(OmegaConf.to_yaml(config))
 
 
+def _kernels(output: Path) -> None:
+    """Keep compiled kernels below the output folder where the usual place may not be written.
+
+    Raises StageError if a place was chosen that may not.
+    """
+    chosen = os.environ.get("WARP_CACHE_PATH")
+    usual = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "warp"
+    folder = Path(chosen or usual).expanduser() / (installed("warp") or "")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return
+    except OSError as error:
+        if chosen:
+            reason = f"compiled kernels cannot be kept in {chosen} ({error.strerror})"
+            raise StageError(f"{reason}; set WARP_CACHE_PATH to a folder that can be written, or unset it") from error
+    os.environ["WARP_CACHE_PATH"] = str(output / ".warp")
+
+
+def _free(output: Path) -> int:
+    """Space on the disk of a folder [byte]."""
+    return shutil.disk_usage(output).free
+
+
+def _full(output: Path) -> str:
+    free = f"{_free(output) / 1e6:.1f} MB are free in {output}"
+    return f"the disk is full ({free}); free some space or write elsewhere with output=<folder>"
+
+
 def _quiet() -> None:
     """Libraries talk to themselves; the person watching reads our lines."""
     import warp
@@ -127,7 +179,7 @@ def _quiet() -> None:
     warp.config.log_level = warp.LOG_ERROR
     warnings.filterwarnings("ignore", category=DeprecationWarning)
     warnings.filterwarnings("ignore", category=FutureWarning)
-    for name in ("prefect", "httpx", "alembic", "mlflow"):
+    for name in ("prefect", "httpx", "alembic", "mlflow", "matplotlib"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
 
 

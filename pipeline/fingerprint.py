@@ -1,21 +1,26 @@
 """The fingerprint of a stage: a hash of everything that its result depends on. Computed without importing any of it.
 
-    fingerprint = sha256( configuration,  code it reaches,  fingerprints of its inputs,  content of the files it names )
+    fingerprint = sha256( configuration,  code it reaches,  libraries,  fingerprints of its inputs,  files it reads )
 
 - Configuration: without `device`, which must not change the result beyond round-off, and without where the data lies.
 - Code: the syntax trees (no comments, no docstrings, no line numbers) of the modules named by `_target_` anywhere in
   the configuration, and of every module of this project that they import, at any depth, also from inside functions.
   `physics3d.log` is left out: it decides how progress looks.
-- Files: an entry `path` (or `..._path`) of the configuration is replaced by the names and sha256 of all files under it
-  that are not hidden, which is what `AbstractSource.files()` lists and at most a little more; the source itself could
-  only be asked by importing torch. Digests are remembered by size and modification time: the second look is fast.
+- Libraries: major and minor version of those that compute and that this code imports.
+- Files: an entry `path` (or `..._path`), and weights (`model`, `weights`) that lie on this machine, are replaced by the
+  names and sha256 of all files under it that are not hidden; weights of the hub by their commit in its cache. Beside
+  these, the files that a source itself says it reads, wherever they lie: `AbstractSource.files()`, which the caller
+  asks. Digests are remembered by size and modification time: the second look is fast.
 """
 
 import ast
 import hashlib
+import importlib.metadata
 import json
 import os
-from collections.abc import Iterator
+import re
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -23,14 +28,39 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("physics3d", "stages")
 PRESENTATION = ("physics3d.log",)
+# what computes: name in an import statement -> the packages that may bring it
+LIBRARIES = {
+    "torch": ("torch",),
+    "torchvision": ("torchvision",),
+    "warp": ("warp-lang",),
+    "numpy": ("numpy",),
+    "scipy": ("scipy",),
+    "cv2": ("opencv-python-headless", "opencv-python"),
+    "PIL": ("pillow",),
+    "open3d": ("open3d-cpu", "open3d"),
+    "pycolmap": ("pycolmap",),
+    "torchmetrics": ("torchmetrics",),
+    "diffusers": ("diffusers",),
+    "transformers": ("transformers",),
+    "sam2": ("sam2",),
+    "gsplat": ("gsplat",),
+    "imageio_ffmpeg": ("imageio-ffmpeg",),
+}
 
 
-def fingerprint(config: dict[str, Any], inputs: list[str], digests: Path | None = None) -> str:
+def fingerprint(
+    config: dict[str, Any], inputs: list[str], digests: Path | None = None, files: Iterable[tuple[str, Path]] = ()
+) -> str:
     """Sixteen hexadecimal digits for a stage with this `config` and inputs of these fingerprints.
 
-    `digests` is the file in which digests of data files are remembered. Raises ValueError if a path does not exist.
+    `files` are what its sources say they read, by a name that does not change when all of it is moved; `digests` is the
+    file in which digests of data files are remembered. Raises ValueError if a path does not exist.
     """
-    parts = [_essential(config, digests), code_digest(tuple(sorted(targets(config)))), inputs]
+    code = tuple(sorted(targets(config)))
+    known = Digests(digests)
+    contents = [(name, known.of(path) if path.is_file() else "missing") for name, path in sorted(files)]
+    parts = [_essential(config, known), code_digest(code), libraries(code), inputs, contents]
+    known.keep()
     return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()[:16]
 
 
@@ -45,6 +75,30 @@ def targets(config: Any) -> set[str]:
 @cache
 def code_digest(names: tuple[str, ...], root: Path = ROOT) -> str:
     """Hash of the syntax trees of these modules (or classes in them) and of all project modules they import."""
+    trees = [(m, _tree_digest(_file(m, root))) for m in _reached(names, root)]
+    return hashlib.sha256(json.dumps(trees).encode()).hexdigest()[:16]
+
+
+@cache
+def libraries(names: tuple[str, ...], root: Path = ROOT) -> dict[str, str]:
+    """Library -> major.minor, of those that compute and that the code reached from `names` imports."""
+    imported = {name.split(".")[0] for module in _reached(names, root) for name in _imports(module, root)}
+    found = {name: installed(name) for name in LIBRARIES if name in imported}
+    return {name: ".".join(version.split(".")[:2]) for name, version in found.items() if version}
+
+
+@cache
+def installed(library: str) -> str | None:
+    """Version of one of `LIBRARIES`; None where it is missing."""
+    for package in LIBRARIES[library]:
+        with suppress(importlib.metadata.PackageNotFoundError):
+            return importlib.metadata.version(package)
+    return None
+
+
+@cache
+def _reached(names: tuple[str, ...], root: Path) -> tuple[str, ...]:
+    """The project modules that importing `names` runs, at any depth, but for those that only decide how things look."""
     reached: set[str] = set()
     waiting = [module for name in names for module in _modules(name, root)]
     while waiting:
@@ -52,8 +106,7 @@ def code_digest(names: tuple[str, ...], root: Path = ROOT) -> str:
         if module not in reached:
             reached.add(module)
             waiting.extend(m for name in _imports(module, root) for m in _modules(name, root))
-    trees = [(m, _tree_digest(_file(m, root))) for m in sorted(reached - set(PRESENTATION))]
-    return hashlib.sha256(json.dumps(trees).encode()).hexdigest()[:16]
+    return tuple(sorted(reached - set(PRESENTATION)))
 
 
 def _file(module: str, root: Path) -> Path:
@@ -106,42 +159,41 @@ def _tree_digest(path: Path) -> str:
     return hashlib.sha256(ast.dump(tree).encode()).hexdigest()
 
 
-def _essential(config: Any, digests: Path | None) -> Any:
+def _essential(config: Any, known: "Digests") -> Any:
     if isinstance(config, list | tuple):
-        return [_essential(v, digests) for v in config]
+        return [_essential(v, known) for v in config]
     if not isinstance(config, dict):
         return config
-    essential = {k: _essential(v, digests) for k, v in config.items() if k != "device"}
-    for key in essential:
-        if key.split("_")[-1] == "path" and isinstance(essential[key], str):
-            essential[key] = content_digest(Path(essential[key]), digests)
+    essential = {k: _essential(v, known) for k, v in config.items() if k != "device"}
+    for key, value in essential.items():
+        if not isinstance(value, str):
+            continue
+        if key.split("_")[-1] == "path":
+            essential[key] = content_digest(Path(value), known)
+        elif "_target_" in config and key in ("model", "weights"):
+            here = Path(value).expanduser()
+            essential[key] = content_digest(here, known) if here.exists() else [value, _commit(value)]
     return essential
 
 
-def content_digest(path: Path, digests: Path | None = None) -> str:
+def _commit(name: str) -> str | None:
+    """The commit of a repository of the hub that its cache on this machine holds."""
+    home = Path(os.environ.get("HF_HOME") or "~/.cache/huggingface")
+    cache = Path(os.environ.get("HF_HUB_CACHE") or home / "hub").expanduser()
+    if re.fullmatch(r"[\w.-]+/[\w.-]+", name):
+        with suppress(OSError, ValueError):
+            return (cache / f"models--{name.replace('/', '--')}" / "refs" / "main").read_text().strip()
+    return None
+
+
+def content_digest(path: Path, known: "Digests") -> str:
     """Hash of a file, or of the names and contents of all files under a folder that are not hidden."""
     path = path.expanduser()
     if not path.exists():
         raise ValueError(f"no such file or folder: {path}; say where the data lies with DATA=<folder> (data=<folder>)")
-    if path.suffix == ".json":  # it names images beside it
-        path = path.parent
-    known: dict[str, list] = {}
-    if digests is not None and digests.is_file():
-        try:
-            known = json.loads(digests.read_text())
-        except ValueError:
-            known = {}
-    fresh = {}
-    lines = []
-    for file in _files(path):
-        stat = file.stat()
-        key, state = str(file.resolve()), [stat.st_size, stat.st_mtime_ns]
-        if known.get(key, [])[:2] != state:
-            fresh[key] = [*state, file_digest(file)]
-        relative = file.relative_to(path).as_posix() if path.is_dir() else file.suffix
-        lines.append((relative, (fresh.get(key) or known[key])[2]))
-    if digests is not None and fresh:
-        _remember(digests, known | fresh)
+    if not path.is_dir():
+        return path.suffix + known.of(path)
+    lines = [(file.relative_to(path).as_posix(), known.of(file)) for file in _files(path)]
     return hashlib.sha256(json.dumps(lines).encode()).hexdigest()
 
 
@@ -150,20 +202,61 @@ def file_digest(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def _files(path: Path) -> Iterator[Path]:
-    if path.is_file():
-        yield path
-        return
-    for folder, folders, names in os.walk(path, followlinks=True):
+def _files(folder: Path) -> Iterator[Path]:
+    seen = set()  # links may lead back
+    for place, folders, names in os.walk(folder, followlinks=True):
         folders[:] = sorted(f for f in folders if not f.startswith("."))
-        yield from (Path(folder, name) for name in sorted(names) if not name.startswith("."))
+        if (here := os.path.realpath(place)) in seen:
+            folders.clear()
+            continue
+        seen.add(here)
+        files = (Path(place, name) for name in sorted(names) if not name.startswith("."))
+        yield from (file for file in files if file.is_file())
 
 
-def _remember(digests: Path, known: dict[str, list]) -> None:
-    temporary = digests.with_suffix(f".{os.getpid()}")
-    try:
-        digests.parent.mkdir(parents=True, exist_ok=True)
-        temporary.write_text(json.dumps(known))
-        temporary.replace(digests)
-    except OSError:  # only costs time: the files are read again next time
-        temporary.unlink(missing_ok=True)
+class Digests:
+    """Digests of files, remembered by size and time of change in a file on the shelf."""
+
+    def __init__(self, memory: Path | None):
+        self.memory = memory
+        self.known = recall(memory) if memory else {}
+        self.fresh: dict[str, list] = {}
+
+    def of(self, path: Path) -> str:
+        """sha256 of a file. Raises ValueError if it cannot be read."""
+        try:
+            if not path.is_file():
+                raise OSError(None, "it is neither a file nor a folder")
+            stat = path.stat()
+            key, state = str(path.resolve()), [stat.st_size, stat.st_mtime_ns]
+            match self.fresh.get(key) or self.known.get(key):
+                case [size, changed, str(digest)] if [size, changed] == state:
+                    return digest
+            self.fresh[key] = [*state, file_digest(path)]
+        except OSError as error:
+            raise ValueError(f"cannot read {path}: {error.strerror}") from error
+        return self.fresh[key][2]
+
+    def keep(self) -> None:
+        if self.memory and self.fresh:
+            remember(self.memory, self.known | self.fresh)
+
+
+def recall(memory: Path) -> dict[str, Any]:
+    """What `remember` wrote; nothing if that is missing or damaged."""
+    with suppress(OSError, ValueError, RecursionError):
+        stored = json.loads(memory.read_text())
+        return stored if isinstance(stored, dict) else {}
+    return {}
+
+
+def remember(memory: Path, known: dict[str, Any]) -> None:
+    """Write a table as a whole or not at all; without it, things only take longer."""
+    temporary = memory.with_name(f"{memory.name}.{os.getpid()}")
+    with suppress(OSError):
+        try:
+            memory.parent.mkdir(parents=True, exist_ok=True)
+            temporary.write_text(json.dumps(known))
+            temporary.replace(memory)
+        finally:
+            temporary.unlink(missing_ok=True)

@@ -12,10 +12,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from pipeline.page import STAGES
 from pipeline.server import server
-from pipeline.stage import Filed, Part, Step, as_task, build, damage, peek, usual_seconds
-
-STAGES = ("capture", "guess", "reconstruct", "segment", "fill", "learn", "simulate", "render", "evaluate")
+from pipeline.stage import Filed, Part, StageError, Step, Unknown, as_task, build, damage, load, peek, usual_seconds
 
 
 @dataclass(frozen=True)
@@ -26,19 +25,22 @@ class Plan:
     left_out: dict[str, str] = field(default_factory=dict)
 
 
-def first(config: dict[str, Any], shelf: Path) -> Step:
-    """The step that everything else depends on: what it finds decides which stages are needed."""
-    return Step.of("capture", "capture", config["capture"], (), shelf)
+def first(config: dict[str, Any], shelf: Path, ask: bool = True) -> Step:
+    """The step that everything else depends on: what it finds decides which stages are needed.
+
+    `ask` sources what they read, see `Step.of`, here and in `plan`.
+    """
+    return Step.of("capture", "capture", config["capture"], (), shelf, ask)
 
 
-def plan(config: dict[str, Any], capture: Step) -> Plan:
+def plan(config: dict[str, Any], capture: Step, ask: bool = True) -> Plan:
     """The graph of a scene whose capture has been filed."""
     without = left_out(config, peek(capture.folder), capture.shelf)
     steps = [capture]
 
     def step(name: str, *inputs: Any, stage: str | None = None) -> Step:
         stage = stage or name
-        steps.append(Step.of(name, stage, config[stage], inputs, capture.shelf))
+        steps.append(Step.of(name, stage, config[stage], inputs, capture.shelf, ask))
         return steps[-1]
 
     guess = step("guess")
@@ -82,10 +84,13 @@ def left_out(config: dict[str, Any], capture: dict[str, Any], shelf: Path) -> di
 
 def up_to_date(config: dict[str, Any], shelf: Path, verify: bool) -> Plan | None:
     """The plan, if every step of it has been filed already, else None."""
-    capture = first(config, shelf)
-    if damage(capture, verify):
+    try:
+        capture = first(config, shelf, ask=False)
+        if damage(capture, verify):
+            return None
+        whole = plan(config, capture, ask=False)
+    except Unknown:
         return None
-    whole = plan(config, capture)
     return None if any(damage(step, verify) for step in whole.steps) else whole
 
 
@@ -94,10 +99,15 @@ def execute(
 ) -> tuple[Plan, list[Filed]]:
     """Run the graph under Prefect; `done` is called after each step. Raises StageError with one line."""
 
+    stages: dict[str, Any] = {}
+
     def check() -> None:
         """Build every stage once, so that a bad value is found before hours of work, not after."""
-        for name in STAGES:
-            build(config.get(name), device, name)
+        try:
+            stages.update({name: build(config.get(name), device, name) for name in STAGES})
+        except ValueError as error:
+            raise StageError(str(error)) from error
+        suit(stages, getattr(getattr(stages["capture"], "source", None), "outline", None), {})
 
     with server(home, meanwhile=check):
         from prefect import flow
@@ -113,6 +123,7 @@ def execute(
             capture = first(config, shelf)
             compute(capture)
             whole = plan(config, capture)
+            suit(stages, getattr(load(capture, device), "outline", None), whole.left_out)
             for name, why in whole.left_out.items():
                 print(f"{name:>16} | left out: {why}", flush=True)
             for step in whole.steps[1:]:
@@ -120,6 +131,16 @@ def execute(
             return whole, list(filed.values())
 
         return physics3d()
+
+
+def suit(stages: dict[str, Any], outline: Any, left_out: dict[str, str]) -> None:
+    """Raise StageError if a stage cannot take a capture of this outline: before the work on it, not after."""
+    for name, stage in stages.items():
+        if outline is not None and name not in left_out and hasattr(stage, "fits"):
+            try:
+                stage.fits(outline)
+            except ValueError as error:
+                raise StageError(f"{name}: {error}") from error
 
 
 def _steps(inputs: Any) -> list[Step]:

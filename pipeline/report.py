@@ -69,7 +69,8 @@ def report(plan: Plan, hits: dict[str, bool]) -> dict[str, float]:
     for video in sorted(steps["render"].folder.glob("*.mp4")):
         console.print(f"video     {_near(video)}", markup=False)
     with suppress(OSError):
-        (steps["render"].shelf / ".latest").write_text(str(steps["render"].folder) + "\n")
+        shelf, folder = steps["render"].shelf, steps["render"].folder
+        (shelf / ".latest").write_text(f"{folder.relative_to(shelf)}\n")  # so that it holds when the shelf is moved
     console.print(f"previews  {_near(steps['render'].folder / 'previews')}   (make view)", markup=False)
     return headline
 

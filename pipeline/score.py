@@ -44,7 +44,7 @@ def score(real: Path, predicted: Path, folder: Path) -> None:
     from physics3d.metrics.scores import Scores
     from physics3d.motion.clip import read_clip
     from physics3d.motion.stills import stills
-    from physics3d.video import contact_sheet
+    from physics3d.pictures import contact_sheet
 
     pair = paired(read_clip(real), read_clip(predicted))
     whole = Reference(pair.real, pair.fps)

@@ -3,11 +3,13 @@
 Prefect would start one by itself, but that one dies before the flow when Ctrl-C reaches the whole terminal, and
 outlives it after `kill -9`. Ours runs in a session of its own under a shell that waits for the end of a pipe
 we hold: however this process ends, the pipe closes and the shell stops the server. Set PREFECT_API_URL to use a server
-of your own.
+of your own. Addresses of this machine go round any proxy.
 """
 
 import fcntl
 import os
+import resource
+import signal
 import socket
 import subprocess
 import sys
@@ -15,9 +17,12 @@ import time
 import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 
-PATIENCE = 180  # a first start creates the database, on a busy machine [s]
+HERE = ("localhost", "127.0.0.1", "::1")
+FILES = 256  # that this process and the server each hold open, at least
+PATIENCE = 600  # a first start creates the database, on a machine that may be busy with ten other things [s]
 SETTINGS = {
     "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
     "PREFECT_TELEMETRY_ENABLE_RESOURCE_METRICS": "false",
@@ -34,6 +39,8 @@ def server(home: Path, meanwhile: Callable[[], None]) -> Iterator[None]:
 
     Must be entered before Prefect is imported. Raises RuntimeError if the server does not come up.
     """
+    _allow_files()
+    _go_round_proxies()
     os.environ.setdefault("PREFECT_HOME", str(home))
     for name, value in SETTINGS.items():
         os.environ.setdefault(name, value)
@@ -60,6 +67,25 @@ def server(home: Path, meanwhile: Callable[[], None]) -> Iterator[None]:
         _stop(process)
 
 
+def _allow_files() -> None:
+    """Raise the limit of open files as far as that is ours to do. Raises RuntimeError if it stays too low."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft != resource.RLIM_INFINITY and soft < FILES:
+        if hard != resource.RLIM_INFINITY and hard < FILES:
+            raise RuntimeError(f"only {hard} files may be open at once here, {FILES} are needed; ulimit -n {FILES}")
+        resource.setrlimit(resource.RLIMIT_NOFILE, (FILES, hard))
+
+
+def _go_round_proxies() -> None:
+    proxies = [value for name, value in os.environ.items() if name.lower().endswith("_proxy")]
+    # httpx, which talks to the server and to the hub, refuses to start beside a SOCKS proxy that it cannot use
+    useless = any(value.startswith("socks") for value in proxies) and find_spec("socksio") is None
+    for name in ("no_proxy", "NO_PROXY"):  # libraries read the one or the other
+        listed = [entry.strip() for entry in os.environ.get(name, "").split(",") if entry.strip()]
+        missing = [host for host in HERE if host not in listed]
+        os.environ[name] = "*" if useless else ",".join([*listed, *missing])
+
+
 def _start(log: Path) -> tuple[subprocess.Popen, str]:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -81,10 +107,11 @@ def _start(log: Path) -> tuple[subprocess.Popen, str]:
 
 
 def _await(process: subprocess.Popen, url: str, log: Path) -> None:
+    direct = urllib.request.build_opener(urllib.request.ProxyHandler({}))
     deadline = time.monotonic() + PATIENCE
     while time.monotonic() < deadline and process.poll() is None:
         try:
-            with urllib.request.urlopen(url, timeout=5):
+            with direct.open(url, timeout=5):
                 return
         except OSError:
             time.sleep(0.1)
@@ -96,5 +123,5 @@ def _stop(process: subprocess.Popen) -> None:
     process.stdin.close()
     try:
         process.wait(timeout=10)
-    except subprocess.TimeoutExpired:
-        process.kill()
+    except subprocess.TimeoutExpired:  # the shell and the server, which are a group of their own
+        os.killpg(process.pid, signal.SIGKILL)

@@ -1,14 +1,15 @@
 """Words of the command line -> one plain configuration, by Hydra; every mistake is one line that names the remedy."""
 
-import difflib
 import re
 from pathlib import Path
 from typing import Any, cast
 
+from pipeline.fields import Unknown, declared
 from pipeline.fingerprint import ROOT
+from pipeline.page import nearest, problem, set_by
 
 CONF = ROOT / "conf"
-GROUPS = ("scene", "material", "prior", "method", "profile")
+GROUPS = ("scene", "material", "prior", "masker", "densification", "solid", "method", "profile")
 
 
 class SettingsError(ValueError):
@@ -35,17 +36,24 @@ def compose(words: list[str]) -> tuple[dict[str, Any], dict[str, str]]:
         groups = [w for w in words if w.split("=")[0] in GROUPS]
         base = compose("config", groups)
         known = cast(dict[str, Any], OmegaConf.to_container(base, resolve=False))
-        values = [w for w in words if w not in groups]
-        for word in values:
-            _check_value(word, known)
+        words = [w if w in groups else _known_or_new(w, known) for w in words]
         try:
             config = compose("config", words, return_hydra_config=True)
             picked = {g: config.hydra.runtime.choices[g] for g in GROUPS if g in config.hydra.runtime.choices}
             OmegaConf.set_struct(config, False)
             del config["hydra"]
-            return cast(dict[str, Any], OmegaConf.to_container(config, resolve=True)), picked
+            written = OmegaConf.to_container(config, resolve=False)
+            composed = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))
         except (HydraException, OmegaConfBaseException) as error:
-            raise SettingsError(str(error).strip().splitlines()[0]) from error
+            gone = re.search(r"(?:Interpolation key '|Error trying to access )([\w.]+)", str(error))
+            line = str(error).strip().splitlines()[0]
+            raise SettingsError(
+                f"{gone[1]} is not there, but others are taken from it; keep it" if gone else line
+            ) from error
+    wrong = problem(composed, cast(dict[str, Any], written))
+    if wrong:
+        raise SettingsError(wrong)
+    return composed, picked
 
 
 def _check_word(word: str) -> None:
@@ -56,17 +64,26 @@ def _check_word(word: str) -> None:
         raise SettingsError(f"no {key} {value!r}; there are {', '.join(choices(key))}")
 
 
-def _check_value(word: str, known: dict[str, Any]) -> None:
-    """Is there such a key, and does the value have the kind of the one it replaces?"""
+def _known_or_new(word: str, known: dict[str, Any]) -> str:
+    """The word; with + in front if its key is a field of the class there that no file mentions; or as Hydra wants it
+    where a name has a dot (material.start.stem.youngs_modulus).
+
+    Raises SettingsError if there is no such key, or the word cannot be read.
+    """
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
 
-    key, _, _ = word.partition("=")
-    if key.startswith(("+", "~")):
-        return
+    try:
+        OverridesParser.create().parse_override(word)
+    except HydraException as error:
+        raise SettingsError(f"cannot read {word!r}: {str(error).splitlines()[0]}") from error
+    key, _, value = word.partition("=")
+    if key.startswith("+"):
+        return word
     node: Any = known
     done: list[str] = []
-    for part in re.split(r"\.", key):
+    parts = key.removeprefix("~").split(".")
+    for i, part in enumerate(parts):
         names = (
             list(node)
             if isinstance(node, dict)
@@ -75,23 +92,30 @@ def _check_value(word: str, known: dict[str, Any]) -> None:
             else []
         )
         if part not in names:
+            rest = ".".join(parts[i:])
+            if rest in names and not key.startswith("~"):
+                return f"{'.'.join(done)}={{{rest}: {value}}}"
+            fields = _fields(node)
+            if part in fields and i == len(parts) - 1 and not key.startswith("~"):
+                return f"+{word}"
             where = f" in {'.'.join(done)}" if done else ""
-            close = difflib.get_close_matches(part, names, 1)
-            hint = (
-                f"did you mean {'.'.join([*done, close[0]])}?" if close else f"there are {', '.join(names) or 'none'}"
-            )
-            raise SettingsError(f"no {part!r}{where}; {hint}")
+            own = set_by(".".join([*done, part]), known)
+            if node is None:
+                raise SettingsError(f"{'.'.join(done)} is null here; give all of it, {'.'.join(done)}=<value>")
+            if own != ".".join([*done, part]):
+                raise SettingsError(f"{key} is taken from {own}; set {'.'.join([own, *parts[i + 1 :]])}")
+            raise SettingsError(f"no {part!r}{where}; {nearest(part, sorted({*names, *fields} - {'_target_'}), done)}")
         node = node[part] if isinstance(node, dict) else node[int(part)]
         done.append(part)
+    return word
+
+
+def _fields(node: Any) -> list[str]:
+    """Fields of the class that a mapping names."""
     try:
-        value = OverridesParser.create().parse_override(word).value()
-    except HydraException as error:
-        raise SettingsError(f"cannot read {word!r}: {str(error).splitlines()[0]}") from error
-    number = isinstance(node, int | float) and not isinstance(node, bool)
-    if number and (isinstance(value, bool) or not isinstance(value, int | float | None)) and "${" not in word:
-        raise SettingsError(f"{key} must be a number such as {node}, not {value}")
-    if isinstance(node, bool) and not isinstance(value, bool | None):
-        raise SettingsError(f"{key} must be true or false, not {value}")
+        return list(declared(node["_target_"]).hints) if isinstance(node, dict) and "_target_" in node else []
+    except Unknown:
+        return []
 
 
 def described(path: Path) -> str:

@@ -10,8 +10,8 @@ dead runs left behind.
 import difflib
 import errno
 import fcntl
+import hashlib
 import importlib
-import importlib.metadata
 import json
 import os
 import platform
@@ -26,15 +26,28 @@ from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.fingerprint import code_digest, file_digest, fingerprint, targets
+from pipeline.fingerprint import (
+    LIBRARIES,
+    code_digest,
+    file_digest,
+    fingerprint,
+    installed,
+    recall,
+    remember,
+    targets,
+)
 
 MANIFEST = "manifest.json"
 SMALL = 1 << 20  # files up to this size are always checked by content, larger ones by size unless asked [byte]
-PACKAGES = ("torch", "warp-lang", "numpy", "scipy", "open3d-cpu", "opencv-python-headless")
+PLAIN = "fields.json"  # what `peek` reads of an artifact, always checked by content
 
 
 class StageError(Exception):
     """A stage failed; the text is one line, `folder` keeps the log and the traceback."""
+
+
+class Unknown(Exception):
+    """Which files a stage reads has not been asked yet, so nothing can have been filed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,12 +62,19 @@ class Step:
     fingerprint: str
 
     @classmethod
-    def of(cls, name: str, stage: str, config: dict[str, Any], inputs: tuple[Any, ...], shelf: Path) -> "Step":
-        """Raises ValueError if the configuration names a path that does not exist."""
+    def of(
+        cls, name: str, stage: str, config: dict[str, Any], inputs: tuple[Any, ...], shelf: Path, ask: bool = True
+    ) -> "Step":
+        """`ask` its sources which files they read, which imports them; else take what was remembered.
+
+        Raises StageError if the configuration names data that does not exist, Unknown if nothing was remembered.
+        """
         try:
-            key = fingerprint(config, [_key(i) for i in inputs], shelf / ".digests.json")
-        except ValueError as error:
-            raise StageError(f"{name}: {error}") from error
+            digests, keys = shelf / ".digests.json", [_key(i) for i in inputs]
+            files = _reads(config, fingerprint(config, keys, digests), shelf / ".reads.json", name, ask)
+            key = fingerprint(config, keys, digests, files)
+        except (ValueError, OSError) as error:
+            raise StageError(f"{name}: {_one_line(error)}") from error
         return cls(name=name, stage=stage, config=config, inputs=inputs, shelf=shelf, fingerprint=key)
 
     @property
@@ -88,7 +108,7 @@ def run(step: Step, device: str, verify: bool = False) -> Filed:
         with _lock(step, wait=True):  # another run may file it while this one waits
             reason = damage(step, verify)
             if reason:
-                if step.folder.exists():
+                if os.path.lexists(step.folder):
                     _say(step, f"the stored result is damaged ({reason}); computing it again")
                 _sweep(step)
                 return Filed(step, False, _compute(step, device, verify))
@@ -96,29 +116,65 @@ def run(step: Step, device: str, verify: bool = False) -> Filed:
 
 
 def damage(step: Step, verify: bool = False) -> str | None:
-    """Why the step's artifact cannot be used: absent, incomplete or altered. None if it is whole."""
+    """Why the step's artifact cannot be used: absent, incomplete, altered, or not ours. None if it is whole."""
     try:
-        for name, (size, digest) in manifest(step)["files"].items():
+        told = manifest(step)
+        if (told["stage"], told["fingerprint"]) != (step.stage, step.fingerprint):
+            return f"it is {told['stage']} {told['fingerprint']}"
+        for name, (size, digest) in told["files"].items():
             path = step.folder / name
+            if path.is_symlink() or not path.is_file():
+                return f"{name} is no file"
             if path.stat().st_size != size:
                 return f"{name} has {path.stat().st_size} bytes, was filed with {size}"
-            if (verify or size <= SMALL) and file_digest(path) != digest:
+            if (verify or size <= SMALL or name == PLAIN) and file_digest(path) != digest:
                 return f"{name} is not what was filed"
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError) as error:
         return str(error) or "unreadable"
     return None
 
 
 def manifest(step: Step) -> dict[str, Any]:
-    return json.loads((step.folder / MANIFEST).read_text())
+    """Raises ValueError if there is none, or none that `run` could have written."""
+    return read_manifest(step.folder)
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """As `manifest`, of any folder on the shelf."""
+    path = folder / MANIFEST
+    if folder.is_symlink() or path.is_symlink() or not path.is_file():
+        raise ValueError(f"no {MANIFEST}" if folder.is_dir() and not folder.is_symlink() else "it is no folder")
+    try:
+        told = json.loads(path.read_text())
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{MANIFEST} is not JSON") from error
+    match told:
+        case {
+            "stage": str(),
+            "fingerprint": str(),
+            "seconds": float() | int(),
+            "peak_rss_bytes": int(),
+            "files": dict(files),
+        } if PLAIN in files and all(_is_entry(name, entry) for name, entry in files.items()):
+            return told
+    raise ValueError(f"{MANIFEST} is not one of ours")
+
+
+def _is_entry(name: str, entry: Any) -> bool:
+    """Whether this is a file inside of its folder, with its size and digest."""
+    match entry:
+        case [int(size), str()] if size >= 0:
+            parts = Path(name).parts
+            return bool(parts) and not Path(name).is_absolute() and ".." not in parts and "\0" not in name
+    return False
 
 
 def usual_seconds(shelf: Path, stage: str) -> float | None:
     """Median time of the results of a stage that are filed on this shelf [s]; None if there is none."""
     times = []
     for path in (shelf / stage).glob(f"*/{MANIFEST}"):
-        with suppress(OSError, ValueError, KeyError):
-            times.append(json.loads(path.read_text())["seconds"])
+        with suppress(OSError, ValueError):
+            times.append(read_manifest(path.parent)["seconds"])
     return statistics.median(times) if times else None
 
 
@@ -135,8 +191,11 @@ def load(source: Any, device: str, verify: bool = False) -> Any:
     run(source, device, verify)
     try:
         return AbstractArtifact.load(source.folder)
-    except ArtifactError:
-        run(source, device, verify=True)  # the sizes are right, so look at the contents
+    except ArtifactError as error:
+        with _lock(source, wait=True):
+            _say(source, f"the stored result is damaged ({error}); computing it again")
+            _remove(source.folder)
+        run(source, device, verify)
         return AbstractArtifact.load(source.folder)
 
 
@@ -229,8 +288,7 @@ def _compute(step: Step, device: str, verify: bool) -> dict[str, Any]:
         manifest = _describe(step, device) | {"seconds": seconds, "peak_rss_bytes": _peak(), "files": _list(temporary)}
         (temporary / MANIFEST).write_text(json.dumps(manifest, indent=1, default=str))
         _flush(temporary)
-        if step.folder.exists():  # damaged
-            shutil.rmtree(step.folder)
+        _remove(step.folder)  # damaged
         temporary.rename(step.folder)
         _flush_entry(step.folder.parent)
         return manifest
@@ -301,12 +359,57 @@ def _sweep(step: Step) -> None:
     for folder in (step.shelf / step.stage).glob(".*"):
         key = folder.name[1:]
         if key == step.fingerprint:  # we hold its lock
-            shutil.rmtree(folder)
+            _remove(folder)
             continue
         other = Step(step.name, step.stage, {}, (), step.shelf, key)
         with _lock(other, wait=False) as mine:
             if mine:
-                shutil.rmtree(folder, ignore_errors=True)
+                with suppress(OSError):
+                    _remove(folder)
+
+
+def _remove(path: Path) -> None:
+    """Remove a folder, or the file or link in its place."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def _reads(config: Any, key: str, memory: Path, name: str, ask: bool) -> list[tuple[str, Path]]:
+    """What the objects of a configuration say they read: (name from the data's folder on, file).
+
+    Asking imports them, so the answer is remembered under the configuration and its `key`, which changes with the
+    content of what it names. Raises ValueError from the sources, Unknown if they may not be asked.
+    """
+    essence = json.dumps([key, config, os.getcwd()], sort_keys=True, default=str)
+    question = hashlib.sha256(essence.encode()).hexdigest()[:16]
+    known = recall(memory)
+    if ask:
+        answer = [[label, str(path)] for label, path in _told(build(config, "cpu", name))]
+        if known.get(question) != answer:
+            remember(memory, known | {question: answer})
+        known[question] = answer
+    match known.get(question):
+        case [*pairs] if all(isinstance(p, list) and [*map(type, p)] == [str, str] for p in pairs):
+            return [(label, Path(path)) for label, path in pairs]
+    raise Unknown
+
+
+def _told(made: Any) -> Iterator[tuple[str, Path]]:
+    """The answers of `files()`, for an object and everything in its fields."""
+    if isinstance(made, dict | tuple):
+        for value in made.values() if isinstance(made, dict) else made:
+            yield from _told(value)
+    elif is_dataclass(made):
+        if hasattr(made, "files"):
+            place = getattr(made, "path", None)
+            base = Path(place).absolute() if isinstance(place, str) else None
+            folder = base if base is None or base.is_dir() else base.parent
+            for file in map(Path, made.files()):
+                yield os.path.relpath(file.absolute(), folder) if folder else file.name, file.absolute()
+        for part in fields(made):
+            yield from _told(getattr(made, part.name))
 
 
 def _key(source: Any) -> str:
@@ -318,10 +421,7 @@ def _key(source: Any) -> str:
 
 
 def _describe(step: Step, device: str) -> dict[str, Any]:
-    versions = {"python": platform.python_version()}
-    for package in PACKAGES:
-        with suppress(importlib.metadata.PackageNotFoundError):
-            versions[package] = importlib.metadata.version(package)
+    versions = {name: version for name in LIBRARIES if (version := installed(name))}
     return {
         "stage": step.stage,
         "fingerprint": step.fingerprint,
@@ -329,7 +429,7 @@ def _describe(step: Step, device: str) -> dict[str, Any]:
         "config": step.config,
         "inputs": [_key(i) for i in step.inputs],
         "device": device,
-        "versions": versions,
+        "versions": {"python": platform.python_version()} | versions,
         "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
     }
 

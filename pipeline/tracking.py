@@ -4,18 +4,27 @@ A stage that was reused is replayed too (tag cache=hit), so that every run shows
 numbers stand on the parent, because parents are what people compare. Tracking may fail, results may not: any error here
 is one warning, and the run goes on without.
 
+The database is made beside its place and renamed, under a lock: a kill while MLflow creates its tables, or two first
+runs at once, leave a whole one or none. MLflow stores where pictures lie as absolute addresses, and keeps a run whose
+process was killed as running; `mend`, before every run, corrects both, and sets aside what is no record. It needs no
+MLflow, only SQLite.
+
     python -m pipeline.tracking <output folder>        prints the address that compares runs, and serves it
 """
 
+import fcntl
 import json
 import logging
 import os
 import re
+import signal
+import socket
 import sqlite3
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -48,8 +57,7 @@ class Tracking:
             action()
         except Exception as error:
             self.broken = True
-            text = " ".join(str(error).split())[:200]
-            print(f"{'mlflow':>16} | warning: not recorded in MLflow, the results are unharmed ({text})", flush=True)
+            _warn(error)
 
     def _open(self, config: dict[str, Any], name: str, tags: dict[str, str]) -> None:
         os.environ.update(DO_NOT_TRACK="true", MLFLOW_DISABLE_TELEMETRY="true")
@@ -57,11 +65,15 @@ class Tracking:
         from mlflow.entities import Param
         from mlflow.tracking import MlflowClient
 
-        logging.getLogger("mlflow").setLevel(logging.ERROR)
-        self.client = MlflowClient(database(self.output))
-        known = self.client.get_experiment_by_name(EXPERIMENT)
-        store = (self.output / "mlartifacts").as_uri()
-        self.experiment = known.experiment_id if known else self.client.create_experiment(EXPERIMENT, store)
+        logging.getLogger("mlflow").setLevel(logging.CRITICAL)  # it would print whole tracebacks; we say one line
+        with _lock(self.output):
+            if not (self.output / "mlflow.db").exists():
+                _make(self.output)
+            self.client = MlflowClient(database(self.output))
+            known = self.client.get_experiment_by_name(EXPERIMENT)
+            store = _store(self.output)
+            self.experiment = known.experiment_id if known else self.client.create_experiment(EXPERIMENT, store)
+        tags = {**tags, "process": _process(os.getpid())}
         self.run = self.client.create_run(self.experiment, run_name=name, tags=tags).info.run_id
         params = [Param(key, str(value)[:500]) for key, value in flatten(config).items()]
         for i in range(0, len(params), 100):
@@ -76,7 +88,8 @@ class Tracking:
             "stage": step.stage,
             "cache": "hit" if filed.hit else "miss",
             "key": step.fingerprint,
-            "artifact": str(folder),
+            "artifact": os.path.relpath(folder, self.output),
+            "process": _process(os.getpid()),
         }
         run = self.client.create_run(self.experiment, run_name=step.name, tags=tags).info.run_id
         now = int(time.time() * 1000)
@@ -122,8 +135,117 @@ def flatten(config: Any, prefix: str = "") -> dict[str, Any]:
     return flat
 
 
+def mend(output: Path) -> None:
+    """Give a record whose folder was moved its new addresses, and close the runs whose processes are gone."""
+    file = output.resolve() / "mlflow.db"
+    if not file.exists():
+        return
+    try:
+        with _lock(output):
+            if not _is_record(file):
+                aside = file.with_name(f"mlflow.db.damaged-{time.strftime('%Y%m%d-%H%M%S')}")
+                file.rename(aside)
+                print(f"{'mlflow':>16} | warning: the record was damaged; it is kept as {aside}, and begun anew")
+                return
+            with closing(_connect(file, "rw")) as record, record:
+                query = "select experiment_id, artifact_location from experiments where name = ?"
+                for experiment, old in record.execute(query, (EXPERIMENT,)).fetchall():
+                    _move(record, experiment, old, _store(output))
+                    _close_dead(record, experiment)
+    except (OSError, sqlite3.Error) as error:
+        _warn(error)
+
+
+def _is_record(file: Path) -> bool:
+    """Whether it has tables of MLflow; one that is busy, or not ours to read, counts as a record."""
+    if not file.is_file():
+        return False
+    try:
+        with closing(_connect(file, "ro")) as record:
+            record.execute("select 1 from experiments, runs, tags limit 1").fetchall()
+        return True
+    except sqlite3.DatabaseError as error:
+        return isinstance(error, sqlite3.OperationalError) and "no such table" not in str(error)
+
+
+def _move(record: sqlite3.Connection, experiment: int, old: str, new: str) -> None:
+    if old == new:
+        return
+    for table, column in (("experiments", "artifact_location"), ("runs", "artifact_uri")):
+        change = f"update {table} set {column} = ? || substr({column}, ?) "
+        change += f"where experiment_id = ? and substr({column}, 1, ?) = ?"
+        record.execute(change, (new, len(old) + 1, experiment, len(old), old))
+
+
+def _close_dead(record: sqlite3.Connection, experiment: int) -> None:
+    query = "select run_uuid, value from runs join tags using (run_uuid) "
+    query += "where experiment_id = ? and status = 'RUNNING' and key = 'process'"
+    dead = [run for run, process in record.execute(query, (experiment,)).fetchall() if _gone(process)]
+    close = "update runs set status = 'KILLED', end_time = ? where run_uuid = ?"
+    record.executemany(close, [(int(time.time() * 1000), run) for run in dead])
+
+
+@contextmanager
+def _lock(output: Path) -> Iterator[None]:
+    with (output / ".mlflow.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # the system takes it back from a dead process
+        yield
+
+
 def database(output: Path) -> str:
+    """Raises ValueError for a folder that MLflow cannot address."""
+    if odd := set("?#%") & set(str(output.resolve())):
+        raise ValueError(f"no address of SQLAlchemy's may hold {' '.join(sorted(odd))}; output=<another folder>")
     return f"sqlite:///{output.resolve() / 'mlflow.db'}"
+
+
+def _store(output: Path) -> str:
+    return (output.resolve() / "mlartifacts").as_uri()
+
+
+def _make(output: Path) -> None:
+    """A database with MLflow's tables: complete under its name, or not there."""
+    from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore
+
+    for old in output.glob("mlflow.db.unfinished*"):  # of a run that was killed here
+        old.unlink()
+    unfinished = output / "mlflow.db.unfinished"
+    store = SqlAlchemyStore(f"{database(output)}.unfinished", _store(output))
+    store.engine.dispose()
+    unfinished.rename(output / "mlflow.db")
+
+
+def _connect(file: Path, mode: str) -> sqlite3.Connection:
+    return sqlite3.connect(f"{file.as_uri()}?mode={mode}", uri=True)
+
+
+def _process(pid: int) -> str:
+    """What tells a process from a later one of the same number: machine, number, start in ticks of its clock."""
+    try:
+        told = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        start = "ended" if told[0] in "ZX" else told[19]
+    except OSError:  # no Linux
+        start = "?"
+    return f"{socket.gethostname()} {pid} {start}"
+
+
+def _gone(process: str) -> bool:
+    """Whether the process of a tag has ended; one of another machine counts as alive."""
+    found = re.fullmatch(r"(.*) (\d{1,9}) (\w+|\?)", process)
+    if not found or found[1] != socket.gethostname():
+        return False
+    try:
+        os.kill(int(found[2]), 0)
+    except ProcessLookupError:
+        return True
+    except PermissionError:  # alive, and somebody else's
+        pass
+    return _process(int(found[2])) != process
+
+
+def _warn(error: Exception) -> None:
+    text = " ".join(str(error).split())[:200]
+    print(f"{'mlflow':>16} | warning: not recorded in MLflow, the results are unharmed ({text})", flush=True)
 
 
 def git_commit(root: Path) -> str:
@@ -137,24 +259,51 @@ def git_commit(root: Path) -> str:
 
 def address(output: Path, port: int = 5000) -> str:
     """The page that compares runs, once `serve` runs."""
-    with sqlite3.connect(f"file:{output / 'mlflow.db'}?mode=ro", uri=True) as connection:
+    with closing(_connect(output.resolve() / "mlflow.db", "ro")) as record:
         query = "select experiment_id from experiments where name = ?"
-        (experiment,) = connection.execute(query, (EXPERIMENT,)).fetchone()
+        (experiment,) = record.execute(query, (EXPERIMENT,)).fetchone()
     return f"http://127.0.0.1:{port}/#/experiments/{experiment}/runs?compareRunsMode=CHART"
 
 
-def serve(output: Path, port: int) -> int:
+def serve(output: Path, port: str) -> int:
     """Print the address and serve it until Ctrl-C."""
     try:
-        print(f"open {address(output, port)}\n(up in about 15 s; Ctrl-C ends it)", flush=True)
+        number = _free(port)
+        mend(output)
+        print(f"open {address(output, number)}\n(up in about 15 s; Ctrl-C ends it)", flush=True)
+        options = ["--backend-store-uri", database(output), "--host", "127.0.0.1", "--port", str(number)]
     except (sqlite3.Error, TypeError):
-        print(f"error: no runs recorded under {output.resolve()} yet; `make run SCENE=carnation` makes one")
+        print(
+            f"error: no runs recorded under {output.resolve()} yet; `make run SCENE=carnation` makes one",
+            file=sys.stderr,
+        )
         return 1
-    options = ["--backend-store-uri", database(output), "--host", "127.0.0.1", "--port", str(port)]
-    try:
-        return subprocess.run([sys.executable, "-m", "mlflow", "ui", *options]).returncode
-    except KeyboardInterrupt:
-        return 0
+    except ValueError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    with subprocess.Popen([sys.executable, "-m", "mlflow", "ui", *options]) as process:
+        try:
+            return process.wait()
+        except KeyboardInterrupt:
+            process.terminate()
+            process.wait()
+            return 0
+
+
+def _free(port: str) -> int:
+    """The number of a port that can be served. Raises ValueError with the remedy."""
+    remedy = "make ui PORT=<a number from 1024 to 65535>"
+    if not re.fullmatch("[0-9]{1,5}", port) or not 0 < int(port) < 65536:
+        raise ValueError(f"PORT={port} is no port; {remedy}")
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # one that was closed a moment ago is free
+        try:
+            probe.bind(("127.0.0.1", int(port)))
+        except OSError as error:
+            taken = f"port {port} cannot be served ({error.strerror}); is `make ui` running elsewhere?"
+            raise ValueError(f"{taken} {remedy}") from error
+    return int(port)
 
 
 def _name(text: str) -> str:
@@ -163,4 +312,4 @@ def _name(text: str) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(serve(Path(sys.argv[1] if len(sys.argv) > 1 else "."), int(os.environ.get("PORT", "5000"))))
+    sys.exit(serve(Path(sys.argv[1] if len(sys.argv) > 1 else "."), os.environ.get("PORT") or "5000"))

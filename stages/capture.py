@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from physics3d.pictures import contact_sheet
 from physics3d.scenes.base import AbstractSource, Capture
-from physics3d.video import contact_sheet, write_mp4
+from physics3d.video import write_mp4
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,24 +2,23 @@
 material."""
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from physics3d.boundaries.base import AbstractBoundary
 from physics3d.log import Log
 from physics3d.metrics.against import Reference
-from physics3d.metrics.pictures import busiest, slices
-from physics3d.metrics.scores import Scores
-from physics3d.scenes.base import Capture, Take
-from physics3d.video import Video, contact_sheet, reduced, write_mp4
+from physics3d.metrics.comparable import matched, same, shrink
+from physics3d.metrics.parameters import parameter_errors
+from physics3d.metrics.previews import previews
+from physics3d.metrics.scores import FROZEN, REFERENCE, Scores
+from physics3d.scenes.base import Capture
+from physics3d.video import Video
 from physics3d.world import Estimate
-from stages.simulate import excited
+from stages.simulate import Force, excited
 
-FROZEN, REFERENCE = "frozen first frame", "reference"
 DIFFERENT = "the simulated excitation is not the one that was filmed: only the eye may compare"
 
 
@@ -28,7 +27,7 @@ class Evaluate:
     """Scores videos against the take with role "evaluate", or against the held-out cameras of the one learned from."""
 
     excitation: tuple[AbstractBoundary, ...] | None = None  # what was simulated; None: what the take was excited by
-    force: Mapping[str, float] | None = None  # of its impulses, as in Simulate [N]
+    force: Force | None = None  # of its impulses, as in Simulate [N]
 
     def __call__(
         self, capture: Capture, videos: dict[str, Video], estimates: dict[str, Estimate], *, log: Log
@@ -93,93 +92,3 @@ class Evaluate:
                 for reason in {cells[name][1] for cells in per_camera} - {""}:
                     notes.setdefault(name, reason)
         return table
-
-
-def same(simulated: tuple[AbstractBoundary, ...], filmed: tuple[AbstractBoundary, ...] | None) -> bool:
-    """Whether both were set in motion alike, to a thousandth of every number; an unknown cause is like no other."""
-    if filmed is None or [type(b) for b in simulated] != [type(b) for b in filmed]:
-        return False
-    pairs = [(getattr(a, f.name), getattr(b, f.name)) for a, b in zip(simulated, filmed) for f in fields(a)]
-    words = (str, type(None))
-    return all(
-        a == b if isinstance(a, words) or isinstance(b, words) else np.allclose(a, b, rtol=1e-3) for a, b in pairs
-    )
-
-
-def matched(name: str, video: Video, take: Take, cameras: tuple[int, ...]) -> list[Tensor]:
-    """The clips of `video` in the order of `cameras`. Raises ValueError if they cannot be those of the take."""
-    video.check()
-    if len(video.frames) == len(cameras):
-        clips = list(video.frames)
-    elif len(video.frames) == len(take.cameras):
-        clips = [video.frames[i] for i in cameras]
-    else:
-        raise ValueError(
-            f"video {name} has {len(video.frames)} cameras, take {take.name} {len(take.cameras)} of which "
-            f"{len(cameras)} are to be evaluated; render those cameras"
-        )
-    if abs(video.fps / take.fps - 1) > 0.01:
-        raise ValueError(
-            f"video {name} has {video.fps:g} frames per second, take {take.name} {take.fps:g}; "
-            "set simulate.fps to the take's"
-        )
-    return clips
-
-
-def shrink(reference: Tensor, clips: dict[str, list[Tensor]], index: int, count: int) -> Tensor:
-    """The reference at the size of the clips, averaged over pixels; ValueError if their shapes disagree."""
-    sizes = {tuple(row[index].shape[1:3]) for row in clips.values()}
-    (h, w), own = next(iter(sizes)), tuple(reference.shape[1:3])
-    if len(sizes) > 1 or h > own[0] or w > own[1] or abs(h * own[1] / (w * own[0]) - 1) > 0.02:
-        raise ValueError(
-            f"videos of {[f'{w} x {h}' for h, w in sizes]} px cannot be compared with a reference of {own[1]} x "
-            f"{own[0]} px; render all at one scale <= 1 with the reference's camera"
-        )
-    return reduced(reference[:count], h, w)
-
-
-def parameter_errors(estimates: dict[str, Estimate], truth: dict[str, float]) -> dict[str, dict[str, float | None]]:
-    """ "learned: youngs_modulus" -> value, truth, error [%], ln(value/truth); means over particles of a field."""
-    table: dict[str, dict[str, float | None]] = {}
-    for parameter, true in truth.items():
-        for row, estimate in estimates.items():
-            if parameter in estimate.parameters:
-                value = float(torch.as_tensor(estimate.parameters[parameter]).double().mean())
-                positive = value > 0 and true > 0
-                table[f"{row}: {parameter}"] = {
-                    "value": value,
-                    "truth": float(true),
-                    "error_percent": 100 * (value - true) / abs(true) if true else None,
-                    "log_ratio": math.log(value / true) if positive else None,
-                }
-    return table
-
-
-def previews(rows: dict[str, list[Tensor]], fps: float, scores: Scores, log: Log) -> None:
-    """What one looks at: films side by side, sheets of frames, space-time slices, bars."""
-    shown = [name for name in rows if name != FROZEN]
-    for camera in range(len(rows[REFERENCE])):
-        clips = [rows[name][camera] for name in shown]
-        suffix = f"_{camera}" if len(rows[REFERENCE]) > 1 else ""
-        write_mp4(log.path(f"previews/side_by_side{suffix}.mp4"), torch.cat(clips, 2), fps)
-        log.image(f"frames{suffix}", contact_sheet(torch.cat(clips, 1), columns=8, count=8))  # one row per video
-        log.image(f"slices{suffix}", slices(shown, clips, *busiest(rows[REFERENCE][camera])))
-    log.image("bars", bars(scores))
-
-
-def bars(scores: Scores):
-    """A figure: one panel per metric, one bar per video."""
-    from matplotlib.figure import Figure
-
-    from physics3d.metrics.scores import UNITS, columns
-
-    names = [n for n in columns(scores.values) if any(c.get(n) is not None for c in scores.values.values())]
-    figure = Figure(figsize=(2.2 * len(names), 2.8), layout="constrained")
-    for i, name in enumerate(names):
-        axis = figure.add_subplot(1, len(names), i + 1)
-        cells = {row: c.get(name) for row, c in scores.values.items()}
-        known = {row: value for row, value in cells.items() if value is not None and math.isfinite(value)}
-        axis.bar(range(len(known)), list(known.values()), color=[f"C{list(cells).index(row)}" for row in known])
-        axis.set_title(UNITS.get(name, name), fontsize=9)
-        axis.set_xticks(range(len(known)), list(known), rotation=60, ha="right", fontsize=8)
-    return figure

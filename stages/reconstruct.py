@@ -1,15 +1,23 @@
 """Photographs -> 3D Gaussians."""
 
 from dataclasses import dataclass, field
+from typing import Annotated, Literal
 
 import torch
+from annotated_types import Ge
 
-from physics3d.gaussians.densify import AbstractDensification, Adaptive
-from physics3d.gaussians.fit import Photograph, Rates, background_points, fit, from_points, held_out_psnr, random_points
+from physics3d.checks import Count, Device, Pixels, Positive, Seed, Share, require_fields
+from physics3d.gaussians.adam import Rates
+from physics3d.gaussians.densification.adaptive import Adaptive
+from physics3d.gaussians.densification.base import AbstractDensification
+from physics3d.gaussians.fit import fit
 from physics3d.gaussians.floaters import floaters
+from physics3d.gaussians.loss import held_out_psnr
 from physics3d.gaussians.model import Gaussians
+from physics3d.gaussians.photograph import Photograph
 from physics3d.gaussians.ply import write_ply
 from physics3d.gaussians.render import render
+from physics3d.gaussians.start import background_points, from_points, random_points
 from physics3d.log import Log
 from physics3d.scenes.base import Capture
 
@@ -20,19 +28,19 @@ FLOATER_VIEWS = 32  # photographs asked whether they need a Gaussian that stands
 class Reconstruct:
     """Fit Gaussians to the photographs of a capture; also leaves `gaussians.ply` for any 3DGS viewer."""
 
-    iterations: int = 1500
-    max_gaussians: int = 20_000
-    sh_degree: int = 1  # 0: colour does not depend on the viewing direction
-    longest_side: int = 320  # photographs are reduced to this [px]
-    ssim_weight: float = 0.2
+    iterations: Count = 1500
+    max_gaussians: Count = 20_000
+    sh_degree: Literal[0, 1, 2, 3] = 1  # 0: colour does not depend on the viewing direction
+    longest_side: Annotated[Pixels, Ge(16)] = 320  # photographs are reduced to this [px]
+    ssim_weight: Share = 0.2
     rates: Rates = field(default_factory=Rates)
     densification: AbstractDensification = field(default_factory=Adaptive)  # where Gaussians are added and removed
     exposure: bool = False  # learn a gain and an offset per photograph and channel; those held out get none
-    floaters: float | None = 2.0  # see gaussians/floaters.py [standard deviations]; null: keep them
-    check_every: int = 250  # iterations between looks at the held-out photographs
-    patience: int = 3  # checks without improvement before it stops early
-    seed: int = 0
-    device: str = "cpu"
+    floaters: Positive | None = 2.0  # see gaussians/floaters.py [standard deviations]; null: keep them
+    check_every: Count = 250  # iterations between looks at how well it fits
+    patience: Count = 3  # looks at photographs trained on without improvement before it stops early
+    seed: Seed = 0
+    device: Device = "cpu"
 
     def __call__(self, capture: Capture, *, log: Log) -> Gaussians:
         """Raises ValueError for settings out of range or a capture without photographs."""
@@ -82,19 +90,10 @@ class Reconstruct:
         return gaussians
 
     def check(self) -> None:
-        for name in ("iterations", "max_gaussians", "check_every", "patience"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"reconstruct.{name} is {getattr(self, name)}; it must be at least 1")
-        if self.densification.every < 1:
-            raise ValueError(f"reconstruct.densification.every is {self.densification.every}; it must be at least 1")
-        if self.floaters is not None and not self.floaters > 0:
-            raise ValueError(f"reconstruct.floaters is {self.floaters}; it must be positive, 2 is usual, or null")
-        if self.longest_side < 16:
-            raise ValueError(f"reconstruct.longest_side is {self.longest_side} px; it must be at least 16")
-        if self.sh_degree not in (0, 1, 2, 3):
-            raise ValueError(f"reconstruct.sh_degree is {self.sh_degree}; it must be 0, 1, 2 or 3")
-        if not 0 <= self.ssim_weight <= 1:
-            raise ValueError(f"reconstruct.ssim_weight is {self.ssim_weight}; it must lie in 0..1")
+        """Raise ValueError naming field, value and remedy."""
+        require_fields(self, "reconstruct")
+        self.rates.check()
+        self.densification.check()
 
     def without_floaters(
         self, gaussians: Gaussians, training: list[Photograph], views: list[Photograph], background, log: Log

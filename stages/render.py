@@ -2,18 +2,24 @@
 
 import time
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
+from annotated_types import Gt, Le
 
-from physics3d.filling.fill import Body
+from physics3d.checks import Device, Text, Whole, require_fields
+from physics3d.filling.body import Body
 from physics3d.gaussians.cameras import Camera
 from physics3d.gaussians.deform import Backdrop, render_deformed
 from physics3d.gaussians.interior import Interior, paint
 from physics3d.gaussians.model import Gaussians
 from physics3d.log import Log
-from physics3d.mpm.rollout import Trajectory
-from physics3d.scenes.base import Capture
-from physics3d.video import Video, contact_sheet, space_time_slice, to_uint8, write_mp4
+from physics3d.pictures import contact_sheet, space_time_slice, to_uint8
+from physics3d.scenes.base import Capture, Outline
+from physics3d.trajectory import Trajectory
+from physics3d.video import Video, write_mp4
+
+LEAST_MOTION = 1.0  # [px]: what moves less is not seen to
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,16 +30,21 @@ class Render:
     learn from that were held out. A capture without takes is seen from `view`.
     """
 
-    view: int | str | None = None  # index or name of the photograph whose camera is used; None: the first one
-    scale: float = 1.0  # pixels of the video per pixel of the camera, along each side
+    view: Whole | Text | None = None  # index or name of the photograph whose camera is used; None: the first one
+    scale: Annotated[float, Gt(0), Le(16)] = 1.0  # pixels of the video per pixel of the camera, along each side
     interior: bool = True  # draw the inside, in the colours of the surface, where the body opens
-    paint: int = 0  # steps by which the colours of the inside are refined on the photographs' cameras (L_Fill)
-    device: str = "cpu"
+    paint: Whole = 0  # steps by which the colours of the inside are refined on the photographs' cameras (L_Fill)
+    device: Device = "cpu"
+
+    def check(self) -> None:
+        """Raise ValueError naming field, value and remedy."""
+        require_fields(self, "render")
 
     def __call__(
         self, capture: Capture, gaussians: Gaussians, body: Body, trajectory: Trajectory, *, log: Log
     ) -> Video:
         """Returns one video per camera. Raises ValueError if `view` is not in the capture."""
+        self.check()
         cameras = self.cameras(capture)
         model = gaussians.to(self.device)
         embedding = body.embedding
@@ -54,6 +65,7 @@ class Render:
                 )  # fmt: skip
             return to_uint8(drawn.color)
 
+        self.say_motion(cameras, trajectory, log)
         spent = 0.0
         for x, F in log.progress(zip(trajectory.position, trajectory.deformation), "render", total=count):
             x, F = x.to(self.device), F.to(self.device)
@@ -75,6 +87,34 @@ class Render:
             log.image(f"{name}_space_time", space_time_slice(video, row=video.shape[1] // 2))
         log.info(f"{count} frames from {len(frames)} camera(s): {', '.join(f'{name}.mp4' for name in frames)}")
         return Video(frames=tuple(frames.values()), names=tuple(frames), fps=trajectory.fps)
+
+    def fits(self, outline: Outline) -> None:
+        """Raise ValueError if `view` is not one of the photographs, as far as these are known and no take is filmed."""
+        if outline.names is None or outline.takes:
+            return
+        if isinstance(self.view, str) and self.view not in outline.names:
+            raise ValueError(f"render.view is {self.view!r}; the photographs are {', '.join(outline.names[:8])}, ...")
+        if isinstance(self.view, int) and self.view >= len(outline.names):
+            raise ValueError(f"render.view is {self.view}; the capture has views 0 to {len(outline.names) - 1}")
+
+    def say_motion(self, cameras: dict[str, Camera], trajectory: Trajectory, log: Log) -> None:
+        """How far the particle that is seen to move most moves in the pictures [px]; a warning if that is nothing."""
+        furthest = 0.0
+        for camera in cameras.values():
+            start, depth = camera.project(trajectory.rest_position.double())
+            for x in trajectory.position:
+                now, behind = camera.project(x.double())
+                seen = (depth > 0) & (behind > 0)
+                if seen.any():
+                    furthest = max(furthest, float((now - start)[seen].norm(dim=1).max()))
+        log.metric("motion_px", furthest)
+        if furthest >= LEAST_MOTION:
+            log.info(f"the body moves by up to {furthest:.2g} pixels")
+        else:
+            log.warn(
+                f"nothing is seen to move: at most {furthest:.2g} pixels; push harder (simulate.force, "
+                "scene.excitation), soften the material, or let go of what holds it (scene.boundaries, fill.attach)"
+            )
 
     def inside(
         self, capture: Capture, model: Gaussians, body: Body, trajectory: Trajectory, log: Log
@@ -103,11 +143,6 @@ class Render:
         if take is not None:
             picks = take.held_out_cameras or range(len(take.cameras))
             return {f"camera{i}": take.cameras[i].scaled(self.scale) for i in picks}
-        view = 0 if self.view is None else self.view
-        if isinstance(view, str):
-            if view not in capture.names:
-                raise ValueError(f"render.view is {view!r}; the photographs are {', '.join(capture.names[:8])}, ...")
-            view = capture.names.index(view)
-        if not 0 <= view < len(capture.cameras):
-            raise ValueError(f"render.view is {view}; the capture has views 0 to {len(capture.cameras) - 1}")
+        self.fits(capture.outline)
+        view = capture.names.index(self.view) if isinstance(self.view, str) else self.view or 0
         return {"view": capture.cameras[view].scaled(self.scale)}

@@ -1,30 +1,31 @@
 """Photographs + Gaussians + what a person pointed at -> which Gaussians may move."""
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 import torch
+from annotated_types import Ge
 
+from physics3d.checks import Count, Device, Pixels, Whole, require_fields
 from physics3d.gaussians.model import Gaussians
 from physics3d.gaussians.render import render
 from physics3d.log import Log
-from physics3d.scenes.base import Capture
+from physics3d.pictures import tiled
+from physics3d.scenes.base import Capture, Outline
 from physics3d.segmentation import Segmentation
-from physics3d.segmentation.lift import contributions, islands, lift, one_hot, shares, touching
-from physics3d.segmentation.masks import AbstractMasker, GrabCut
-from physics3d.segmentation.previews import contact_sheet, tinted
-from physics3d.segmentation.prompts import (
-    Prompt,
-    Room,
-    View,
-    carry_masks,
-    mask_of_box,
-    numbered,
-    prompted_mask,
-    refined_masks,
-    told_apart,
-    within_any,
-)
+from physics3d.segmentation.belief import one_hot, shares
+from physics3d.segmentation.carry_masks import carry_masks, refined_masks
+from physics3d.segmentation.claims import numbered, told_apart
+from physics3d.segmentation.lift import contributions, lift
+from physics3d.segmentation.maskers.base import AbstractMasker
+from physics3d.segmentation.maskers.grabcut import GrabCut
+from physics3d.segmentation.neighbours import beside_static, islands
+from physics3d.segmentation.previews import tinted
+from physics3d.segmentation.prompted import mask_of_box, prompted_mask
+from physics3d.segmentation.prompts import Prompt, within_any
+from physics3d.segmentation.rooms import Room
+from physics3d.segmentation.views import View, spread_out, view_of
 
 LEAST_PIXELS = 20  # a mask smaller than this is no mask
 
@@ -35,15 +36,34 @@ class Segment:
 
     prompts: tuple[Prompt, ...] = ()
     masker: AbstractMasker = field(default_factory=GrabCut)
-    views: int = 16  # photographs that are masked, spread around the object
-    size: int = 480  # longer side of the photographs as they are masked [px]
-    rounds: int = 2  # of masking every photograph again, by what all together say
-    device: str = "cpu"
+    views: Count = 16  # photographs that are masked, spread around the object
+    size: Annotated[Pixels, Ge(32)] = 480  # longer side of the photographs as they are masked [px]
+    rounds: Whole = 2  # of masking every photograph again, by what all together say
+    device: Device = "cpu"
+
+    def check(self) -> None:
+        """Raise ValueError naming field, value and remedy."""
+        require_fields(self, "segment")
+        for prompt in self.prompts:
+            prompt.check()
+
+    def fits(self, outline: Outline) -> None:
+        """Raise ValueError if a prompt is for a photograph that is not there, as far as that is known."""
+        if not outline.names:
+            return
+        for prompt in self.prompts:
+            if prompt.in_image:
+                _index(outline, prompt.view)
+        if not self.prompts and outline.mattes is False:
+            raise ValueError(
+                f"segment.prompts is empty and {outline.name} has no mattes; say what moves, e.g. "
+                "scene.prompts=[{view: 0, box: [0.3, 0.2, 0.7, 0.8]}] in fractions of width and height"
+            )
 
     def __call__(self, capture: Capture, gaussians: Gaussians, *, log: Log) -> Segmentation:
         """Raises ValueError naming view and prompt if a prompt is outside the image or finds nothing."""
-        for prompt in self.prompts:
-            prompt.check()
+        self.check()
+        self.fits(capture.outline)
         parts = tuple(dict.fromkeys(p.part for p in self.prompts)) or ("body",)
         gaussians = gaussians.to(self.device)
 
@@ -55,7 +75,7 @@ class Segment:
             for _ in range(self.rounds if self.prompts else 0):
                 views, maps = every, self._refine(gaussians, label, every, parts, rooms, capture, log)
                 label = self._lift(gaussians, views, maps, parts, rooms)
-            log.image("masks", contact_sheet([tinted(v.image, m.numpy()) for v, m in zip(views, maps)]))
+            log.image("masks", tiled([tinted(v.image, m.numpy()) for v, m in zip(views, maps)]))
             gaussians = gaussians.to("cpu")
         else:
             views, maps = [], []
@@ -64,7 +84,7 @@ class Segment:
 
         apart = islands(gaussians.mean, gaussians.opacity, label)
         label[apart] = 0
-        touch = touching(gaussians.mean, gaussians.opacity, label)
+        touch = beside_static(gaussians.mean, gaussians.opacity, label)
         for k, part in enumerate(parts, 1):
             count = int((label == k).sum())
             log.info(f"{part}: {count} of {len(label)} Gaussians")
@@ -74,12 +94,9 @@ class Segment:
                     f"no Gaussian belongs to {part!r}; correct segment.prompts, see the previews of segment"
                 )
         log.info(f"{int(apart.sum())} Gaussians of small islands went back to static")
-        log.info(
-            f"{int(touch.sum())} moving Gaussians lie next to static ones"
-            + ("; the body is attached there" if touch.any() else "; nothing holds the body")
-        )
+        log.info(f"{int(touch.sum())} moving Gaussians lie next to static ones")
         log.metric("islands", int(apart.sum()))
-        log.metric("attached", int(touch.sum()))
+        log.metric("beside_static", int(touch.sum()))
         self._show(capture, gaussians, label, log)
 
         masks = None
@@ -94,15 +111,10 @@ class Segment:
         self, capture: Capture, gaussians: Gaussians, parts: tuple[str, ...]
     ) -> tuple[dict[str, tuple[View, np.ndarray]], dict[str, Room]]:
         """For each part that is prompted in an image: that view with its mask, and the space that the part may take."""
-        if not self.prompts and not capture.alphas:
-            raise ValueError(
-                f"segment.prompts is empty and {capture.name} has no mattes; say what moves, e.g. "
-                "prompts=[{view: 0, box: [0.3, 0.2, 0.7, 0.8]}] in fractions of width and height"
-            )
         said: dict[str, tuple[View, np.ndarray]] = {}
-        in_image = [(p, _index(capture, p.view)) for p in self.prompts if p.in_image]
+        in_image = [(p, _index(capture.outline, p.view)) for p in self.prompts if p.in_image]
         for index in dict.fromkeys(index for _, index in in_image):
-            view, here = self._view(capture, gaussians, index), [p for p, i in in_image if i == index]
+            view, here = view_of(capture, gaussians, index, self.size), [p for p, i in in_image if i == index]
             masks = {}
             for part in dict.fromkeys(p.part for p in here):
                 if part in said:
@@ -181,37 +193,14 @@ class Segment:
 
     def _views(self, capture: Capture, gaussians: Gaussians, said, rooms: dict[str, Room], log: Log) -> list[View]:
         """The prompted views, and training photographs that show the parts whole, spread by farthest camera."""
-        if self.views < 1:
-            raise ValueError(f"segment.views is {self.views}, must be at least 1")
         first = list(dict.fromkeys(view.index for view, _ in said.values()))
         training = [i for i in range(len(capture.images)) if i not in capture.held_out or i in first]
         whole = [i for i in training if i in first or all(r.whole_in(capture.cameras[i]) for r in rooms.values())]
         candidates = whole if len(whole) >= min(self.views, 4) else training
         if len(candidates) < len(training):
             log.info(f"{len(candidates)} of {len(training)} photographs show the whole object")
-        centres = torch.stack([capture.cameras[i].centre for i in candidates])
-        chosen = first or [candidates[0]]
-        distance = torch.full((len(candidates),), torch.inf, dtype=torch.float64)
-        for i in chosen:
-            distance = torch.minimum(distance, (centres - capture.cameras[i].centre).norm(dim=1))
-        while len(chosen) < min(self.views, len(candidates)):
-            k = int(distance.argmax())
-            chosen.append(candidates[k])
-            distance = torch.minimum(distance, (centres - centres[k]).norm(dim=1))
-            distance[k] = -1
-        return [self._view(capture, gaussians, i) for i in log.progress(chosen, "rendering depth")]
-
-    def _view(self, capture: Capture, gaussians: Gaussians, index: int) -> View:
-        import cv2
-
-        image, camera = capture.images[index].numpy(), capture.cameras[index]
-        if max(image.shape) > self.size:
-            camera = camera.scaled(self.size / max(image.shape))
-            image = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-        with torch.no_grad():
-            rendered = render(gaussians, camera, background=capture.background)
-        rendered = type(rendered)(color=rendered.color.cpu(), alpha=rendered.alpha.cpu(), depth=rendered.depth.cpu())
-        return View(index, capture.names[index], image, camera, rendered)
+        chosen = spread_out(capture.cameras, candidates, first, self.views)
+        return [view_of(capture, gaussians, i, self.size) for i in log.progress(chosen, "rendering depth")]
 
     def _boxes(self, part: str) -> tuple[Prompt, ...]:
         return tuple(p for p in self.prompts if p.part == part and p.lower is not None)
@@ -243,18 +232,19 @@ class Segment:
                 with torch.no_grad():
                     color = render(gaussians.select(chosen), camera, background=(1.0, 1.0, 1.0)).color
                 pictures.append((color.clamp(0, 1) * 255).round().to(torch.uint8).numpy())
-            log.image(name, contact_sheet(pictures))
+            log.image(name, tiled(pictures))
 
 
-def _index(capture: Capture, view: str | int) -> int:
+def _index(outline: Outline, view: str | int) -> int:
     """Index of a view given by name or number. Raises ValueError listing some names."""
-    if isinstance(view, int) and 0 <= view < len(capture.names):
+    names = outline.names or ()
+    if isinstance(view, int) and 0 <= view < len(names):
         return view
-    if view in capture.names:
-        return capture.names.index(view)
+    if view in names:
+        return names.index(view)
     raise ValueError(
-        f"prompt: view {view!r} is not in {capture.name}; give an index below {len(capture.names)} or a name such as "
-        + ", ".join(capture.names[:3])
+        f"prompt: view {view!r} is not in {outline.name}; give an index below {len(names)} or a name such as "
+        + ", ".join(names[:3])
     )
 
 

@@ -1,17 +1,22 @@
 """Particles and their material -> trajectory."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Annotated, TypeGuard
 
 import torch
 
 from physics3d.boundaries.base import AbstractBoundary
 from physics3d.boundaries.impulse import Impulse
-from physics3d.filling.fill import Body
+from physics3d.checks import Device, Frames, Keys, Rate, require_fields
+from physics3d.filling.body import Body
+from physics3d.filling.in_world import look_ahead
 from physics3d.log import Log
-from physics3d.mpm.rollout import Trajectory, rollout
+from physics3d.solver import motion_of
+from physics3d.trajectory import Trajectory
 from physics3d.world import Estimate, World
+
+Force = Annotated[Mapping[str, float], Keys(("x", "y", "z"))]  # [N]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,28 +24,41 @@ class Simulate:
     """Rolls the body out under the world's boundaries and what excites it here."""
 
     world: World
-    frames: int  # with frame 0, the initial state
-    fps: float  # [1/s]
+    frames: Frames  # with frame 0, the initial state
+    fps: Rate  # [1/s]
     excitation: tuple[AbstractBoundary, ...] = ()
-    force: Mapping[str, float] | None = None  # x, y, z: takes the place of the force of every Impulse above [N]
-    device: str = "cpu"
+    force: Force | None = None  # takes the place of the force of every Impulse above [N]; None: none does
+    device: Device = "cpu"
+
+    def check(self) -> None:
+        """Raise ValueError naming field, value and remedy."""
+        require_fields(self, "simulate")
+        if self.force is not None and any(self.force.values()) and not any(map(_has_force, self.excitation)):
+            raise ValueError(
+                f"simulate.force is {dict(self.force)}, but no impulse in simulate.excitation has a force that it "
+                "could replace; take None and say there what pushes"
+            )
 
     def __call__(self, body: Body, estimate: Estimate, *, log: Log) -> Trajectory:
-        """Raises ValueError as `rollout` does, or if fps is not a rate above 0."""
-        if not 0 < self.fps < math.inf:
-            raise ValueError(f"simulate.fps is {self.fps}; take a rate above 0 1/s")
+        """Raises ValueError as `check`, `look_ahead` and `rollout` do."""
+        self.check()
+        excitation = excited(self.excitation, self.force)
+        look_ahead(body, self.world, excitation, log)
         with torch.no_grad():
-            trajectory = rollout(
+            part = lambda values: self.world.material.per_part(values, body.part, body.parts)
+            motion = motion_of(
                 self.world,
-                self.world.material.per_part(estimate.parameters, body.part, body.parts),
                 body.position,
                 body.volume,
-                velocity=estimate.velocity,
-                excitation=(*body.held(self.world.boundaries), *excited(self.excitation, self.force)),
-                frames=self.frames,
-                frame_dt=1 / self.fps,
+                excitation=(*body.held, *excitation),
+                part=part,
+                matter=body.matter,
                 device=self.device,
                 log=log,
+            )
+            parameters = part(estimate.parameters)
+            trajectory = motion(
+                parameters, velocity=estimate.velocity, frames=self.frames, frame_dt=1 / self.fps, log=log
             )
         trajectory = _on_cpu(trajectory)
         for name, curve in trajectory.health.items():
@@ -65,10 +83,12 @@ def excited(
     if force is None:
         return tuple(excitation)
     vector = (float(force["x"]), float(force["y"]), float(force["z"]))
-    pushed = tuple(
-        replace(b, force=vector) if isinstance(b, Impulse) and b.force is not None else b for b in excitation
-    )
-    return tuple(b for b in pushed if any(vector) or not isinstance(b, Impulse) or b.force is None)
+    pushed = tuple(replace(b, force=vector) if _has_force(b) else b for b in excitation)
+    return tuple(b for b in pushed if any(vector) or not _has_force(b))
+
+
+def _has_force(boundary: AbstractBoundary) -> TypeGuard[Impulse]:
+    return isinstance(boundary, Impulse) and boundary.force is not None
 
 
 def _on_cpu(trajectory: Trajectory) -> Trajectory:
@@ -89,6 +109,10 @@ def _report(trajectory: Trajectory, log: Log) -> None:
     worst = int(max(health["inverted"]))
     if worst:
         log.warn(f"up to {worst} particles are turned inside out; take a smaller cfl, a smaller dx or a weaker force")
+    moved = float((trajectory.position - trajectory.rest_position).norm(dim=2).max())
+    size = float((trajectory.rest_position.amax(0) - trajectory.rest_position.amin(0)).max())
+    log.metric("moved", moved)
+    log.info(f"it moves by at most {1e3 * moved:.3g} mm, {100 * moved / max(size, 1e-12):.2g} % of its size")
     lonely = int(health["isolated"][0])
     if lonely:
         log.warn(f"{lonely} particles have no neighbour within a cell and move alone; fill more densely or enlarge dx")

@@ -18,9 +18,11 @@ from physics3d.boundaries.impulse import Impulse
 from physics3d.boundaries.mesh_collider import MeshCollider
 from physics3d.boundaries.moving_cuboid import MovingCuboid
 from physics3d.boundaries.sequential_release import SequentialRelease
+from physics3d.log import Log
 from physics3d.materials.base import AbstractMaterial
 from physics3d.materials.mixture import Mixture
 from physics3d.materials.neo_hookean import NeoHookean
+from physics3d.mpm.rollout import rollout
 from physics3d.world import World
 
 
@@ -30,6 +32,9 @@ def block(cells: tuple[int, int, int], dx: float, per_cell: int = 2, lower=(0.0,
     position = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     volume = torch.full((len(position),), (dx / per_cell) ** 3, dtype=torch.float64)
     return position + torch.tensor(lower, dtype=torch.float64), volume
+
+
+CUBE, CUBE_VOLUME = block((2, 2, 2), 0.1)
 
 
 def soft_world(**changes) -> World:
@@ -43,6 +48,17 @@ def soft_world(**changes) -> World:
         precision="float64",
     )
     return World(**(values | changes))
+
+
+def small_rollout(
+    world: World | None = None, position=CUBE, volume=CUBE_VOLUME, *, parameters=None, frames=3, frame_dt=0.02, **more
+):
+    """A few frames of a cube of two cells, or of what is given."""
+    world = world or soft_world()
+    parameters = parameters or tensors(world.start)
+    return rollout(
+        world, parameters, position, volume, frames=frames, frame_dt=frame_dt, threads=1, log=Log(None), **more
+    )
 
 
 def tensors(values: dict[str, float]) -> dict[str, torch.Tensor]:

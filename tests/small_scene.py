@@ -4,11 +4,14 @@ import torch
 
 from physics3d.boundaries.fixed_region import FixedRegion
 from physics3d.boundaries.impulse import Impulse
-from physics3d.filling.fill import Body
+from physics3d.filling.body import Body
 from physics3d.gaussians.cameras import Camera, look_at
-from physics3d.gaussians.deform import embed
+from physics3d.gaussians.embedding import embed
 from physics3d.gaussians.model import Gaussians
+from physics3d.learning.chain import chain_of
 from physics3d.learning.fields import GlobalField
+from physics3d.learning.loss import Chain
+from physics3d.log import Log
 from physics3d.materials.viscoelastic import Viscoelastic
 from physics3d.priors.exemplar import Exemplar
 from physics3d.scenes.base import Capture, Take
@@ -19,8 +22,8 @@ ELASTIC = {"youngs_modulus": 2e4, "poissons_ratio": 0.3}
 DAMPED = ELASTIC | {
     "branch_shear_modulus": 6e3,
     "branch_bulk_modulus": 6e3,
-    "shear_viscosity_time": 0.05,
-    "bulk_viscosity_time": 0.05,
+    "shear_relaxation_time": 0.05,
+    "bulk_relaxation_time": 0.05,
 }
 DX = 0.05
 POKE = (Impulse(force=(1.2, 0.0, 0.0), centre=(0.0, 0.0, 0.4), radius=0.12, start=0.0, duration=0.1),)
@@ -76,17 +79,35 @@ def learner(start: dict[str, float], learn: tuple[str, ...], **options) -> Learn
     return Learn(world=world(start, precision), prior=options.pop("prior", Exemplar()), learn=learn, **options)
 
 
+def bar_chain(world: World, field: GlobalField, clip: Capture, frames: int) -> Chain:
+    """The bar in this world, compared with the first frames of the take."""
+    gaussians, body = bar()
+    every = torch.arange(frames)
+    return chain_of(
+        world,
+        Exemplar(),
+        field,
+        clip,
+        gaussians,
+        body,
+        clip.takes[0],
+        every,
+        image_scale=1.0,
+        device="cpu",
+        log=Log(None),
+    )
+
+
 def capture(truth: dict[str, float], *, frames: int = 10, fps: float = 20.0, views: int = 1, held_out=()) -> Capture:
     """Clips rendered by the code under test, with the true parameters."""
-    gaussians, body = bar()
+    gaussians, _ = bar()
     blank = tuple(torch.zeros((frames, c.height, c.width, 3), dtype=torch.uint8) for c in cameras(views))
     take = Take(
         name="poke", role="learn", fps=fps, cameras=cameras(views), videos=blank, excitation=POKE, held_out_cameras=()
     )
     empty = Capture(name="bar", images=(), cameras=(), names=(), gaussians=gaussians, takes=(take,), truth=truth)
     field = GlobalField(start=world(truth).estimate().parameters, learn=("youngs_modulus",))
-    stage = learner(truth, ("youngs_modulus",), frames=frames)
-    chain = stage.chain(empty, gaussians, body, take, field, torch.arange(frames))
+    chain = bar_chain(world(truth), field, empty, frames)
     with torch.no_grad():
         motion = chain.simulate(field.zero())
         videos = [chain.render(motion, view, torch.arange(frames)) for view in range(views)]

@@ -11,7 +11,6 @@ time and are computed on the host in float64 for every substep, so that a window
 """
 
 import abc
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -19,6 +18,8 @@ import torch
 import warp as wp
 from jaxtyping import Float
 from torch import Tensor
+
+from physics3d.checks import require_fields
 
 Vector = tuple[float, float, float]
 NEAREST = 0.499  # [cells] how far in front of a surface nodes of touching particles still obey it
@@ -59,9 +60,9 @@ class AbstractBoundary(abc.ABC):
     that the particle is at rest [m].
     """
 
-    @abc.abstractmethod
     def check(self) -> None:
         """Raise ValueError naming the field, its value and the remedy."""
+        require_fields(self, type(self).__name__)
 
     @abc.abstractmethod
     def parameters(self, setting: Setting) -> Float[Tensor, " k"]:
@@ -73,6 +74,14 @@ class AbstractBoundary(abc.ABC):
 
     def selection(self, setting: Setting) -> Float[Tensor, " p"]:
         """Weight per particle for `acceleration` and `steer`; 0 leaves the particle alone."""
+        return torch.zeros(len(setting.position), dtype=torch.float64)
+
+    def behind(self, setting: Setting) -> Float[Tensor, " p"]:
+        """How deep each particle starts behind a surface of this boundary [m], where nothing should be; else <= 0."""
+        return torch.zeros(len(setting.position), dtype=torch.float64)
+
+    def holds(self, setting: Setting) -> Float[Tensor, " p"]:
+        """1 for particles whose place, at rest, this boundary holds still from the start; else 0."""
         return torch.zeros(len(setting.position), dtype=torch.float64)
 
     def walls(self, setting: Setting) -> tuple[Wall, ...]:
@@ -124,27 +133,6 @@ def require(condition: bool, boundary: AbstractBoundary, field: str, remedy: str
     """Raise ValueError 'HalfSpace.normal is ...; take ...' unless the condition holds."""
     if not condition:
         raise ValueError(f"{type(boundary).__name__}.{field} is {getattr(boundary, field)}; take {remedy}")
-
-
-def require_finite(boundary: AbstractBoundary, *fields: str) -> None:
-    """Raise ValueError unless every field is a finite number or three of them."""
-    for field in fields:
-        value = torch.as_tensor(getattr(boundary, field), dtype=torch.float64).detach()
-        require(bool(torch.isfinite(value).all()), boundary, field, "finite numbers")
-        require(value.shape in ((), (3,)), boundary, field, "one number or three")
-
-
-def require_box(boundary: AbstractBoundary) -> None:
-    """Raise ValueError unless boundary.lower < boundary.upper along each axis."""
-    require_finite(boundary, "lower", "upper")
-    ordered = all(a < b for a, b in zip(boundary.lower, boundary.upper))  # type: ignore[attr-defined]
-    require(ordered, boundary, "lower", f"a corner below upper = {boundary.upper}")  # type: ignore[attr-defined]
-
-
-def require_window(boundary: AbstractBoundary) -> None:
-    """Raise ValueError unless the time window start, duration [s] has a length."""
-    require(math.isfinite(boundary.start), boundary, "start", "a finite time [s]")  # type: ignore[attr-defined]
-    require(boundary.duration > 0, boundary, "duration", "a time above 0 s")  # type: ignore[attr-defined]
 
 
 def overlap(start: float, duration: float, t: float, dt: float) -> float:

@@ -14,7 +14,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from physics3d.boundaries import base
-from physics3d.boundaries.half_space import KINDS
+from physics3d.boundaries.half_space import Kind
+from physics3d.checks import Corners
 from physics3d.warp_types import vector
 
 
@@ -22,21 +23,23 @@ from physics3d.warp_types import vector
 class BoundingBox(base.AbstractBoundary):
     """Walls at lower and upper [m]; None takes the border of the simulated region."""
 
-    kind: str = "slip"
+    kind: Kind = "slip"
     lower: base.Vector | None = None
     upper: base.Vector | None = None
 
-    def check(self) -> None:
-        base.require(self.kind in KINDS, self, "kind", f"one of {KINDS}")
-        base.require((self.lower is None) == (self.upper is None), self, "lower", "both corners or neither")
-        if self.lower is not None:
-            base.require_box(self)
+    RULES = (Corners("lower", "upper"),)
 
     def parameters(self, setting: base.Setting) -> Float[Tensor, "6"]:
         lower = torch.tensor(self.lower or setting.lower, dtype=torch.float64)
         upper = torch.tensor(self.upper or setting.upper, dtype=torch.float64)
         slack = 1e-3 * setting.dx  # a node on the wall belongs to it whatever the rounding
         return torch.cat([lower + slack, upper - slack])
+
+    def behind(self, setting: base.Setting) -> Float[Tensor, " p"]:
+        lower, upper = (
+            setting.position.new_tensor(c) for c in (self.lower or setting.lower, self.upper or setting.upper)
+        )
+        return torch.maximum(lower - setting.position, setting.position - upper).amax(1)
 
     def walls(self, setting: base.Setting) -> tuple[base.Wall, ...]:
         if self.kind == "separate":

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from physics3d.boundaries import base
+from physics3d.checks import Direction, Duration, Length, Time
 from physics3d.warp_types import matrix, vector
 
 
@@ -24,19 +25,12 @@ class EnforcedRotation(base.AbstractBoundary):
     """Turns what is within `radius` of the axis and within `half_height` of `point` along it [m], at rest."""
 
     point: base.Vector  # on the axis [m]
-    axis: base.Vector  # any length
-    radius: float
-    half_height: float
+    axis: Direction  # any length
+    radius: Length
+    half_height: Length
     angular_velocity: float  # right-handed about the axis [rad/s]
-    start: float = 0.0
-    duration: float
-
-    def check(self) -> None:
-        base.require_finite(self, "point", "axis", "angular_velocity")
-        base.require(sum(k * k for k in self.axis) > 0, self, "axis", "a vector that is not zero")
-        base.require(self.radius > 0, self, "radius", "a length above 0 m")
-        base.require(self.half_height > 0, self, "half_height", "a length above 0 m")
-        base.require_window(self)
+    start: Time = 0.0
+    duration: Duration
 
     def selection(self, setting: base.Setting) -> Float[Tensor, " p"]:
         r = setting.position - setting.position.new_tensor(self.point)

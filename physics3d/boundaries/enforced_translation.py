@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from physics3d.boundaries import base
+from physics3d.checks import Corners, Duration, Time
 from physics3d.warp_types import matrix, vector
 
 
@@ -23,13 +24,10 @@ class EnforcedTranslation(base.AbstractBoundary):
     lower: base.Vector
     upper: base.Vector
     velocity: base.Vector
-    start: float = 0.0
-    duration: float
+    start: Time = 0.0
+    duration: Duration
 
-    def check(self) -> None:
-        base.require_box(self)
-        base.require_finite(self, "velocity")
-        base.require_window(self)
+    RULES = (Corners("lower", "upper"),)
 
     def selection(self, setting: base.Setting) -> Float[Tensor, " p"]:
         selected = base.inside_box(setting.position, self.lower, self.upper)

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from physics3d.boundaries import base
+from physics3d.checks import Corners, Lasting, Time
 from physics3d.warp_types import vector
 
 
@@ -21,12 +22,10 @@ class FixedRegion(base.AbstractBoundary):
 
     lower: base.Vector
     upper: base.Vector
-    start: float = 0.0  # [s]
-    duration: float = math.inf  # [s]
+    start: Time = 0.0  # [s]
+    duration: Lasting = math.inf  # [s]
 
-    def check(self) -> None:
-        base.require_box(self)
-        base.require_window(self)
+    RULES = (Corners("lower", "upper"),)
 
     def parameters(self, setting: base.Setting) -> Float[Tensor, "6"]:
         slack = 1e-3 * setting.dx  # a node on the surface belongs to the region whatever the rounding
@@ -35,6 +34,10 @@ class FixedRegion(base.AbstractBoundary):
 
     def signals(self, t: float, dt: float) -> tuple[float]:
         return (float(self.start <= t < self.start + self.duration),)
+
+    def holds(self, setting: base.Setting) -> Float[Tensor, " p"]:
+        inside = base.inside_box(setting.position, self.lower, self.upper)
+        return inside if self.start <= 0 else torch.zeros_like(inside)
 
     def node(self, real: type) -> wp.Function:
         return _node(real)

@@ -18,6 +18,7 @@ particles, not by the velocity of the nodes alone: Nairn et al. (2020) New mater
 import functools
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 import warp as wp
@@ -25,9 +26,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from physics3d.boundaries import base
+from physics3d.checks import Direction, NotNegative
 from physics3d.warp_types import vector
 
-KINDS = ("sticky", "slip", "separate")
+Kind = Literal["sticky", "slip", "separate"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,15 +37,9 @@ class HalfSpace(base.AbstractBoundary):
     """Solid ground on the side the normal points away from."""
 
     point: base.Vector  # of the plane [m]
-    normal: base.Vector  # out of the ground, any length
-    kind: str = "sticky"
-    friction: float = 0.0  # Coulomb coefficient, for slip and separate
-
-    def check(self) -> None:
-        base.require(self.kind in KINDS, self, "kind", f"one of {KINDS}")
-        base.require_finite(self, "point", "normal", "friction")
-        base.require(sum(n * n for n in self.normal) > 0, self, "normal", "a vector that is not zero")
-        base.require(self.friction >= 0, self, "friction", "a coefficient >= 0")
+    normal: Direction  # out of the ground, any length
+    kind: Kind = "sticky"
+    friction: NotNegative = 0.0  # Coulomb coefficient, for slip and separate
 
     def parameters(self, setting: base.Setting) -> Float[Tensor, "9"]:
         """Point of the plane (3) [m], unit normal (3), friction, how far in front of it nodes belong to it and what is
@@ -59,6 +55,10 @@ class HalfSpace(base.AbstractBoundary):
                 torch.tensor(rest, dtype=torch.float64),
             ]
         )
+
+    def behind(self, setting: base.Setting) -> Float[Tensor, " p"]:
+        normal = setting.position.new_tensor(self.normal)
+        return (setting.position.new_tensor(self.point) - setting.position) @ normal / normal.norm()
 
     def walls(self, setting: base.Setting) -> tuple[base.Wall, ...]:
         length = math.hypot(*self.normal)

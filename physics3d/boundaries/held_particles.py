@@ -11,6 +11,7 @@ The nodes are a table over the box around them, in `parameters`:
 import functools
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 import warp as wp
 from jaxtyping import Float
@@ -38,7 +39,7 @@ class HeldParticles(base.AbstractBoundary):
         base.require(right and finite, self, "position", "finite positions [h, 3] in metres, at least one")
 
     def parameters(self, setting: base.Setting) -> Float[Tensor, " k"]:
-        _, held = cKDTree(setting.position.numpy()).query(self._positions().numpy())
+        held = self._nearest(setting)
         lower = torch.tensor(setting.lower, dtype=torch.float64)
         cells = (setting.position - lower) / setting.dx
         reach = torch.cartesian_prod(*[torch.arange(-1, 2)] * 3)
@@ -61,8 +62,17 @@ class HeldParticles(base.AbstractBoundary):
         head = torch.cat([lower + first * setting.dx, torch.tensor([1 / setting.dx], dtype=torch.float64)])
         return torch.cat([head, count.double(), still.double()])
 
+    def holds(self, setting: base.Setting) -> Float[Tensor, " p"]:
+        held = torch.zeros(len(setting.position), dtype=torch.float64)
+        held[self._nearest(setting)] = 1.0
+        return held
+
     def node(self, real: type) -> wp.Function:
         return _node(real)
+
+    def _nearest(self, setting: base.Setting) -> np.ndarray:
+        """Index of the particle nearest to each position."""
+        return cKDTree(setting.position.numpy()).query(self._positions().numpy())[1]
 
     def _positions(self) -> Float[Tensor, "h 3"]:
         return torch.as_tensor(self.position, dtype=torch.float64).detach().cpu()

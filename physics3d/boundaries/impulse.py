@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from physics3d.boundaries import base
+from physics3d.checks import Corners, Count, Duration, Length, Time, exactly_one
 from physics3d.warp_types import vector
 
 
@@ -28,31 +29,19 @@ class Impulse(base.AbstractBoundary):
     force: base.Vector | Tensor | None = None  # in total [N]
     acceleration_of_each: base.Vector | Tensor | None = None  # [m/s^2]
     centre: base.Vector | None = None  # [m]
-    radius: float | None = None  # [m]
-    nearest: int | None = None  # particles
+    radius: Length | None = None  # [m]
+    nearest: Count | None = None  # particles
     lower: base.Vector | None = None  # corners of a box [m]
     upper: base.Vector | None = None
-    start: float = 0.0
-    duration: float
+    start: Time = 0.0
+    duration: Duration
 
-    def check(self) -> None:
-        base.require((self.force is None) != (self.acceleration_of_each is None), self, "force",
-                     "a force or an acceleration_of_each")  # fmt: skip
-        what, unit = ("force", "N") if self.force is not None else ("acceleration_of_each", "m/s^2")
-        base.require_finite(self, what)
-        base.require(len(getattr(self, what)) == 3, self, what, f"three numbers [{unit}]")
-        given = [name for name in ("radius", "nearest", "lower") if getattr(self, name) is not None]
-        base.require(
-            len(given) == 1, self, "radius", "one region: centre and radius, centre and nearest, or lower and upper"
-        )
-        base.require((self.lower is None) == (self.upper is None), self, "upper", "both corners or neither")
-        base.require((self.centre is None) == (self.upper is not None), self, "centre", "one for radius or nearest")
-        if self.lower is not None:
-            base.require_box(self)
-        else:
-            base.require_finite(self, "centre", given[0])
-            base.require(getattr(self, given[0]) > 0, self, given[0], "a radius above 0 m, or at least 1 particle")
-        base.require_window(self)
+    RULES = (
+        exactly_one("force", "acceleration_of_each"),
+        Corners("lower", "upper"),
+        exactly_one("radius", "nearest", "lower"),
+        exactly_one("centre", "lower"),
+    )
 
     def selection(self, setting: base.Setting) -> Float[Tensor, " p"]:
         if self.lower is not None and self.upper is not None:

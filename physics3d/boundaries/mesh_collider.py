@@ -37,7 +37,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from physics3d.boundaries import base
-from physics3d.boundaries.half_space import KINDS, coulomb
+from physics3d.boundaries.half_space import Kind, coulomb
+from physics3d.checks import Lasting, NotNegative, Positive
 from physics3d.open3d_import import open3d
 from physics3d.warp_types import matrix, vector, vector4
 
@@ -54,17 +55,18 @@ class MeshCollider(base.AbstractBoundary):
     path: str | None = None  # .obj, .ply or .stl
     vertices: Float[Tensor, "n 3"] | tuple[base.Vector, ...] | None = None
     triangles: Int[Tensor, "m 3"] | tuple[tuple[int, int, int], ...] | None = None  # rows of `vertices`
-    scale: float = 1.0  # of the mesh's coordinates to metres
+    scale: Positive = 1.0  # of the mesh's coordinates to metres
     rotation: base.Vector = (0.0, 0.0, 0.0)  # about the mesh's origin: axis times angle [rad]
     position: base.Vector = (0.0, 0.0, 0.0)  # of the mesh's origin [m]
     velocity: base.Vector = (0.0, 0.0, 0.0)  # [m/s]
     angular_velocity: base.Vector = (0.0, 0.0, 0.0)  # about `position`, which travels along [rad/s]
-    start: float = 0.0  # [s]
-    duration: float = math.inf  # [s]
-    kind: str = "sticky"
-    friction: float = 0.0  # Coulomb coefficient, for slip and separate
+    start: float = 0.0  # before the first frame: it is under way then [s]
+    duration: Lasting = math.inf  # [s]
+    kind: Kind = "sticky"
+    friction: NotNegative = 0.0  # Coulomb coefficient, for slip and separate
 
     def check(self) -> None:
+        super().check()
         if self.path is None:
             for field in ("vertices", "triangles"):
                 base.require(getattr(self, field) is not None, self, field, "vertices with triangles, or a path")
@@ -74,11 +76,6 @@ class MeshCollider(base.AbstractBoundary):
             base.require(self.triangles is None, self, "triangles", "none beside a path")
             base.require(Path(self.path).suffix.lower() in SUFFIXES, self, "path", f"a file of {SUFFIXES}")
             base.require(Path(self.path).is_file(), self, "path", "a file that exists")
-        base.require_finite(self, "scale", "rotation", "position", "velocity", "angular_velocity", "friction")
-        base.require(self.scale > 0, self, "scale", "a factor above 0")
-        base.require(self.kind in KINDS, self, "kind", f"one of {KINDS}")
-        base.require(self.friction >= 0, self, "friction", "a coefficient >= 0")
-        base.require_window(self)
 
     def parameters(self, setting: base.Setting) -> Float[Tensor, " k"]:
         """Corner of the samples (3) [m], 1/h [1/m], samples along each axis (3), friction, the largest phi of a node of
@@ -123,6 +120,13 @@ class MeshCollider(base.AbstractBoundary):
         velocity = np.array(self.velocity)
         place = np.array(self.position) + now * velocity
         return (*place, *_turn(now * axis).flat, *(share * velocity), *gradient.flat)
+
+    def behind(self, setting: base.Setting) -> Float[Tensor, " p"]:
+        vertices, triangles = self._mesh()
+        placed = self.scale * vertices @ _turn(np.array(self.rotation)).T
+        pose = np.array(self.signals(0.0, 0.0))
+        places = (setting.position.numpy() - pose[:3]) @ pose[3:12].reshape(3, 3)  # rows: R^T (x - p)
+        return -torch.from_numpy(_signed_distance(placed, triangles, placed.mean(0), places)).double()
 
     def node(self, real: type) -> wp.Function:
         return _node(real, self.kind)
@@ -182,18 +186,24 @@ def _distance(
     vertices: bytes, triangles: bytes, corner: base.Vector, count: tuple[int, int, int], spacing: float
 ) -> Float[Tensor, " k"]:
     """Signed distance [m], below 0 inside, at count[0] x count[1] x count[2] places from the corner on."""
-    o3d = open3d()
-    origin = np.array(corner)  # float32 rays: small numbers keep their digits
-    points = (np.frombuffer(vertices).reshape(-1, 3) - origin).astype(np.float32)
-    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(
-        o3d.core.Tensor(points), o3d.core.Tensor(np.frombuffer(triangles, np.int32).reshape(-1, 3).astype(np.uint32))
-    )
     axes = [np.arange(n, dtype=np.float32) * np.float32(spacing) for n in count]
     places = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    points, faces = np.frombuffer(vertices).reshape(-1, 3), np.frombuffer(triangles, np.int32).reshape(-1, 3)
+    return torch.from_numpy(_signed_distance(points, faces, np.array(corner), places, relative=True))
+
+
+def _signed_distance(
+    vertices: np.ndarray, triangles: np.ndarray, origin: np.ndarray, places: np.ndarray, relative: bool = False
+) -> np.ndarray:
+    """Distance [m] of places [k, 3] from a closed mesh, below 0 inside; they count from the origin if `relative`."""
+    o3d = open3d()
+    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+    # float32 rays: small numbers keep their digits
+    points = (vertices - origin).astype(np.float32)
+    scene.add_triangles(o3d.core.Tensor(points), o3d.core.Tensor(triangles.astype(np.uint32)))
+    local = np.ascontiguousarray(places if relative else places - origin, np.float32)
     # rays through edges may be counted twice: three samples outvote one
-    distance = scene.compute_signed_distance(o3d.core.Tensor(places), nthreads=1, nsamples=3).numpy()
-    return torch.from_numpy(distance)
+    return scene.compute_signed_distance(o3d.core.Tensor(local), nthreads=1, nsamples=3).numpy()
 
 
 def _cross(w: np.ndarray) -> np.ndarray:

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from physics3d.boundaries import base
+from physics3d.checks import Corners, Duration
 from physics3d.warp_types import vector
 
 
@@ -22,13 +23,10 @@ class MovingCuboid(base.AbstractBoundary):
     lower: base.Vector
     upper: base.Vector
     velocity: base.Vector
-    start: float = 0.0
-    duration: float
+    start: float = 0.0  # before the first frame: it is under way then [s]
+    duration: Duration
 
-    def check(self) -> None:
-        base.require_box(self)
-        base.require_finite(self, "velocity")
-        base.require_window(self)
+    RULES = (Corners("lower", "upper"),)
 
     def parameters(self, setting: base.Setting) -> Float[Tensor, "9"]:
         slack = 1e-3 * setting.dx  # a node on the surface belongs to the block whatever the rounding
@@ -39,6 +37,13 @@ class MovingCuboid(base.AbstractBoundary):
     def signals(self, t: float, dt: float) -> tuple[float, float]:
         """(1 while it is there, time since it came [s])"""
         return float(self.start <= t < self.start + self.duration), t - self.start
+
+    def behind(self, setting: base.Setting) -> Float[Tensor, " p"]:
+        if not self.start <= 0 < self.start + self.duration:
+            return super().behind(setting)
+        lower, upper, velocity = (setting.position.new_tensor(v) for v in (self.lower, self.upper, self.velocity))
+        x = setting.position + self.start * velocity  # where the block was as it came
+        return torch.minimum(x - lower, upper - x).amin(1)
 
     def node(self, real: type) -> wp.Function:
         return _node(real)

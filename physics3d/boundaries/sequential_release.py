@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from physics3d.boundaries import base
+from physics3d.checks import Corners, Count, Direction, Duration, Time
 from physics3d.warp_types import matrix, vector
 
 
@@ -23,18 +24,12 @@ class SequentialRelease(base.AbstractBoundary):
 
     lower: base.Vector
     upper: base.Vector
-    direction: base.Vector  # from the slice that is released first to the last, any length
-    layers: int
-    start: float = 0.0
-    interval: float  # [s]
+    direction: Direction  # from the slice that is released first to the last, any length
+    layers: Count
+    start: Time = 0.0
+    interval: Duration  # [s]
 
-    def check(self) -> None:
-        base.require_box(self)
-        base.require_finite(self, "direction")
-        base.require(sum(d * d for d in self.direction) > 0, self, "direction", "a vector that is not zero")
-        base.require(self.layers >= 1, self, "layers", "at least 1")
-        base.require(math.isfinite(self.start), self, "start", "a finite time [s]")
-        base.require(0 < self.interval < math.inf, self, "interval", "a time above 0 s")
+    RULES = (Corners("lower", "upper"),)
 
     def selection(self, setting: base.Setting) -> Float[Tensor, " p"]:
         """1 + number of the slice."""

@@ -5,43 +5,39 @@ is its pictures. A camera tells of a point x at depth z, with the pixel it falls
 
     outline    (1/2 - m) / |slope of m|, m the share of the pixel that is the body's: where m < 1/2, x is not the body's
                unless something static hides it
-    depth      d - z where z < d + t: in front of what is seen there, or just behind it; d is the depth of the Gaussian
-               at which half the light is gone, if that is the body's, less twice its deviation along the ray
+    depth      d - z where z < d + t: in front of what is seen there, or just behind it; d is where the pixel's ray
+               meets the Gaussian at which half the light is gone, if that is the body's, less FRONT deviations along
+               the ray: its centre may be as far beside the ray as it is broad
 
 Outlines exclude: the distance is the largest but for a tenth of the cameras, so that a few mistaken masks carve
 nothing. Depths are uncertain: the distance is their mean, cut off at the truncation t (Curless and Levoy 1996). The
 larger of the two holds. What no camera sees keeps -t.
-
-What the body stands on or leans against bounds it where no camera looks: `ground` is the same surface of the static
-Gaussians around it, closed under the body by Poisson reconstruction.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy import ndimage
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from physics3d.gaussians.cameras import Camera
 from physics3d.gaussians.model import Gaussians
 from physics3d.gaussians.rasterize import rasterize
+from physics3d.gaussians.splat import LOW_PASS
 from physics3d.log import Log
-from physics3d.open3d_import import open3d
 
 MOST_VIEWS = 32
 MOST_POINTS = 3_000_000  # of the lattice
 PER_SPACING = 3  # points of the lattice
 EDGE = 2.0  # [px] over which the share of an edge falls from 1 to 0: low pass, pixel and the Gaussians' own slope
 LIMB = 2.0  # deviations by which the outlines of layers of Gaussians lie outside of their centres
-GROUND = 0.5  # how far around the body static Gaussians are looked at, of its size
-LEAST_GROUND = 100  # of them
-DOUBT = 0.5  # slope that the ground may have where nothing shows it
+# deviations by which their near side lies before them: 3 make balls of Gaussians at known depths as large as their
+# pictures, 4 the stem of the reconstructed carnation as thick as it is
+FRONT = 3.5
 FAR = 1e6  # depth where nothing is seen [m]
-Depth = Callable[[np.ndarray], np.ndarray]  # of points [m, 3] [m] -> [m] [m]
 
 
 @dataclass(frozen=True)
@@ -106,7 +102,7 @@ def seen(
     covariance = gaussians.covariance()
     shown = (label > 0).to(gaussians.mean)[:, None].expand(-1, 3)
     floor = (1e-3 * spacing) ** 2 * torch.eye(3, dtype=torch.float64)  # discs of no thickness have an inverse too
-    mean, precision = gaussians.mean.double().cpu(), torch.linalg.inv(covariance.double().cpu() + floor)
+    mean, shape = gaussians.mean.double().cpu(), covariance.double().cpu() + floor
     moving = label.cpu() > 0
     which = np.unique(np.linspace(0, len(cameras) - 1, min(MOST_VIEWS, len(cameras))).round().astype(int))
     mistaken = max(len(which) // 10, int(len(which) > 1))  # cameras that may be
@@ -118,11 +114,8 @@ def seen(
             drawn = rasterize(
                 gaussians.mean, covariance, gaussians.opacity, shown, camera, background=(0.0, 0.0, 0.0), median=True
             )
-        ray = mean - camera.centre
-        ray = ray / (ray @ camera.world_to_camera[2, :3])[:, None]
-        deviation = torch.einsum("ni,nij,nj->n", ray, precision, ray).rsqrt().float()  # of the depth [m]
-        at, median = drawn.at.long().cpu(), drawn.median.cpu()  # type: ignore[union-attr]
-        front = torch.where(at >= 0, median - LIMB * deviation[at], FAR)
+        at = drawn.at.long().cpu()  # type: ignore[union-attr]
+        front = _front(at, mean, shape, camera)
         body = (at >= 0) & moving[at]
         shown_at, hidden_at = torch.where(body, front, -FAR), torch.where(body, FAR, front)
         uv, z = camera.project(x)
@@ -150,65 +143,27 @@ def seen(
     )
 
 
-@dataclass(frozen=True)
-class Ground:
-    """What the body stands on or leans against: a surface closed under the body."""
+def _front(
+    at: Int[Tensor, "h w"], mean: Float[Tensor, "n 3"], shape: Float[Tensor, "n 3 3"], camera: Camera
+) -> Float[Tensor, "h w"]:
+    """Depth [m] of the near side of the Gaussian `at` every pixel, where the pixel's ray meets it; FAR for -1.
 
-    behind: Depth  # how deep points lie, along the normal of the nearest triangle
-    doubt: Depth  # by how much that may be wrong: a share of the way to where the ground is seen
-    hidden: np.ndarray  # [k, 3] points of it that no camera sees [m]
-    normal: np.ndarray  # [k, 3] there, out of the ground
-
-
-def ground(
-    gaussians: Gaussians,
-    label: Int[Tensor, " n"],
-    cameras: Sequence[Camera],
-    *,
-    lower: np.ndarray,
-    upper: np.ndarray,
-    spacing: float,
-    opacity: float,
-    log: Log,
-) -> Ground | None:
-    """Of what is static, label 0 and above this `opacity`, around the box of a body [m]; None if there is too little.
-
-    It is seen at half the resolution of the body, whose particles are `spacing` [m] apart.
+    A Gaussian as it is drawn, with the low pass, is densest on the ray o + s d at s = (d P (m - o))/(d P d): of a disc
+    that is the place on it, however wide it is and wherever on it its centre lies.
     """
-    reach = GROUND * float((upper - lower).max())
-    box = dict(lower=lower - reach, upper=upper + reach)
-    mean = gaussians.mean.double().cpu().numpy()
-    around = ((mean > box["lower"]) & (mean < box["upper"])).all(1)
-    static = mean[around & ((label == 0) & (gaussians.opacity > opacity)).cpu().numpy()]
-    if len(static) < LEAST_GROUND:
-        return None
-    view = seen(gaussians, (label == 0).int(), cameras, **box, spacing=2 * spacing, log=log)
-    point, normal, found = view.settled(static, 4 * spacing)
-    found &= view.deep(point - 1.5 * view.truncation * normal)  # not a sheet with a view of its other side
-    if found.sum() < LEAST_GROUND:
-        return None
-    o3d = open3d()
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(point[found]))
-    cloud.normals = o3d.utility.Vector3dVector(normal[found])
-    depth = int(np.clip(np.ceil(np.log2((upper - lower + 2 * reach).max() / (2 * spacing))), 6, 8))
-    mesh, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, n_threads=1)
-    # the largest piece: the others are bubbles round strays
-    of, _, area = (np.asarray(a) for a in mesh.cluster_connected_triangles())
-    mesh.remove_triangles_by_mask(of != area.argmax())
-    mesh.remove_unreferenced_vertices()
-    mesh.compute_vertex_normals()
-    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(mesh))
-
-    def behind(x: np.ndarray) -> np.ndarray:
-        nearest = scene.compute_closest_points(o3d.core.Tensor(x.astype(np.float32)), nthreads=1)
-        return -((x - nearest["points"].numpy()) * nearest["primitive_normals"].numpy()).sum(1)
-
-    known = cKDTree(point[found])
-    doubt = lambda x: DOUBT * known.query(x)[0]
-    vertex, outward = np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals)
-    hidden = view.deep(vertex) & ((vertex > lower) & (vertex < upper)).all(1)
-    return Ground(behind=behind, doubt=doubt, hidden=vertex[hidden], normal=outward[hidden])
+    chosen = at >= 0
+    which = at[chosen]
+    origin, direction = camera.rays(torch.float64)
+    d, away = direction[chosen], mean[which] - origin
+    depth = away @ camera.world_to_camera[2, :3].double()
+    blur = LOW_PASS / (camera.fx * camera.fy) * depth**2
+    drawn = torch.linalg.inv(shape[which] + blur[:, None, None] * torch.eye(3, dtype=torch.float64))
+    towards = torch.einsum("ni,nij->nj", d, drawn)
+    densest = (towards * away).sum(1) / (towards * d).sum(1)
+    deviation = torch.einsum("ni,nij,nj->n", d, torch.linalg.inv(shape[which]), d).rsqrt()
+    front = torch.full(at.shape, FAR)
+    front[chosen] = (densest - FRONT * deviation).float()
+    return front
 
 
 def _read(picture: Float[Tensor, "h w"], pixel: Float[Tensor, "m 2"], mode: str) -> Float[Tensor, " m"]:

@@ -1,0 +1,1 @@
+"""Gaussians: what they are, how they are drawn, fitted to photographs and carried by particles."""

@@ -7,17 +7,27 @@ surfaces are far from their neighbours as well, but they are drawn.
 """
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from physics3d.gaussians.cameras import Camera
 from physics3d.gaussians.model import Gaussians
 from physics3d.gaussians.rasterize import contribution
+from physics3d.gaussians.splat import VISIBLE
 from physics3d.open3d_import import open3d
 
 NEIGHBOURS = 20
 DRAWN = 1.0  # [px]
-VISIBLE = 1 / 255  # opacity below which a Gaussian is never drawn
+
+
+def lonely(mean: Float[Tensor, "n 3"], deviations: float) -> Bool[Tensor, " n"]:
+    """Which points [m] are alone: their mean distance to their neighbours is `deviations` above the average of all."""
+    o3d = open3d()
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(mean.double().numpy()))
+    _, kept = cloud.remove_statistical_outlier(min(NEIGHBOURS, len(mean) - 1), deviations)
+    alone = torch.ones(len(mean), dtype=torch.bool)
+    alone[torch.tensor(kept, dtype=torch.long)] = False
+    return alone
 
 
 def floaters(gaussians: Gaussians, cameras: list[Camera], *, deviations: float) -> Bool[Tensor, " n"]:
@@ -32,10 +42,7 @@ def floaters(gaussians: Gaussians, cameras: list[Camera], *, deviations: float) 
     if len(drawn) <= NEIGHBOURS:
         alone[drawn] = False
         return alone
-    o3d = open3d()
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(gaussians.mean.detach().cpu()[drawn].double().numpy()))
-    _, kept = cloud.remove_statistical_outlier(NEIGHBOURS, deviations)
-    alone[drawn[torch.tensor(kept, dtype=torch.long)]] = False
+    alone[drawn] = lonely(gaussians.mean.detach().cpu()[drawn], deviations)
     for camera in cameras if alone.any() else ():
         everywhere = torch.ones(1, camera.height, camera.width, device=gaussians.mean.device)
         alone &= contribution(gaussians, camera, everywhere)[:, 0].cpu() < DRAWN

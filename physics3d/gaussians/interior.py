@@ -11,8 +11,8 @@ the undeformed scene, and any rigid, compressed or moderately stretched one, is 
 
     L_Fill = 1/T sum_views |I_p - I_r|^2
 
-with I_p the scene at rest with the inside drawn (e = 1), I_r without it (method.md, section 4): only the colours of the
-inside change, by an optimiser of their own.
+with I_p the scene at rest with the inside drawn (e = 1), I_r without it (docs/method.md, section 7): only the colours
+of the inside change, by an optimiser of their own.
 """
 
 from collections.abc import Sequence

@@ -33,8 +33,10 @@ from torch import Tensor
 from physics3d.artifact import require_finite
 from physics3d.gaussians.cameras import Camera
 from physics3d.gaussians.model import Gaussians
-from physics3d.gaussians.splatting import ENTRIES, Kernels, Numerics, kernels
-from physics3d.gaussians.splatting import NEAR as NEAR
+from physics3d.gaussians.splat import ENTRIES, Numerics
+from physics3d.gaussians.splat import NEAR as NEAR
+from physics3d.gaussians.splatting import Kernels, kernels
+from physics3d.warp_start import start_warp
 
 STANDARD = Numerics()
 Tiles = tuple[int, int, int, int]  # first row of tiles, one past the last; first column, one past the last
@@ -176,8 +178,7 @@ def _rows(tensor: Tensor, *shape: int) -> wp.array:
 def _project(
     mean, covariance, opacity, color, camera: Camera, antialiased: bool, numerics: Numerics, drawn: Tiles | None
 ) -> _State:
-    wp.config.log_level = wp.LOG_WARNING
-    wp.init()
+    start_warp()
     n, device = len(mean), mean.device
     mean, covariance, opacity, color = (a.detach().contiguous() for a in (mean, covariance, opacity, color))
     side = 1 if device.type == "cuda" else numerics.tile

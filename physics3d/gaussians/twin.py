@@ -9,7 +9,7 @@ from torch import Tensor
 
 from physics3d.gaussians.cameras import Camera
 from physics3d.gaussians.rasterize import STANDARD, Rendered
-from physics3d.gaussians.splatting import ALPHA_MAX, LOW_PASS, MARGIN, NEAR, Numerics
+from physics3d.gaussians.splat import ALPHA_MAX, LOW_PASS, MARGIN, NEAR, Numerics
 
 
 def rasterize_plainly(

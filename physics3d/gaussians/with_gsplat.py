@@ -11,7 +11,7 @@ from torch import Tensor
 
 from physics3d.gaussians.cameras import Camera
 from physics3d.gaussians.rasterize import Rendered, check
-from physics3d.gaussians.splatting import LOW_PASS, NEAR
+from physics3d.gaussians.splat import LOW_PASS, NEAR
 
 
 def rasterize_with_gsplat(

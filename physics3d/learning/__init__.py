@@ -1,0 +1,1 @@
+"""Material parameters from video: roll out, render, ask the prior, step."""

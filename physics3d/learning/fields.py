@@ -17,6 +17,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from physics3d.materials.parameters import check_old_names
+
 AXES = ("velocity_x", "velocity_y", "velocity_z")
 
 
@@ -33,7 +35,9 @@ class GlobalField:
 
     def __post_init__(self):
         known = ", ".join(self.start)
-        for name in (*self.learn, *(n for tie in self.ties for n in tie)):
+        named = (*self.learn, *(name for tie in self.ties for name in tie))
+        check_old_names(named)
+        for name in named:
             if name not in self.start:
                 raise ValueError(
                     f"learn.learn or learn.ties names {name!r}; the parameters of this material are {known}"
@@ -102,3 +106,12 @@ def poissons_ratio(start: Tensor, offset: Tensor) -> Tensor:
     """Poisson's ratio whose K/mu is exp(offset) times that of `start`."""
     ratio = 2 * (1 + start) / (3 * (1 - 2 * start)) * offset.exp()
     return (3 * ratio - 2) / (2 * (3 * ratio + 1))
+
+
+def physical(field: GlobalField, theta: Tensor) -> dict[str, float]:
+    """The learned parameters in SI units."""
+    values = field.parameters(theta)
+    learned = {name: float(values[name].mean()) for group in field.groups for name in group}
+    if field.velocity_scale is not None:
+        learned |= dict(zip(("velocity_x", "velocity_y", "velocity_z"), field.velocity(theta).tolist()))
+    return learned

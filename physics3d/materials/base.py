@@ -6,23 +6,23 @@ H = F - I, so that float32 keeps small strains. The solver never asks which mode
 """
 
 import abc
-import functools
-import math
+import re
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import torch
 import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from physics3d.materials import spectral
-
-Values = dict[str, Tensor]  # physical name -> scalar or one number per particle, SI
+from physics3d.materials.parameters import Values, check_names, check_range
 
 
 @dataclass(frozen=True, kw_only=True)
 class AbstractMaterial(abc.ABC):
     """A constitutive model. Its fields choose the model; its parameters are the numbers that one learns."""
+
+    RANGES: ClassVar[dict[str, Any]] = {}  # parameter -> what it may be, SI; of further branches (_2, _3) likewise
 
     @property
     @abc.abstractmethod
@@ -33,6 +33,11 @@ class AbstractMaterial(abc.ABC):
     @abc.abstractmethod
     def example(self) -> dict[str, float]:
         """Parameters of an everyday sample: where one may start, and what the tests check the laws on."""
+
+    @property
+    def recovers(self) -> bool:
+        """Whether a body of it comes back to its shape, whatever was done to it: no plastic strain, no flow."""
+        return False
 
     @property
     def memory_rows(self) -> int:
@@ -46,9 +51,11 @@ class AbstractMaterial(abc.ABC):
         """
         return values
 
-    @abc.abstractmethod
     def check_parameters(self, values: Values) -> None:
         """Raise ValueError naming the parameter, its value and the remedy."""
+        check_names(values, self.parameters)
+        for name in self.parameters:
+            check_range(values[name], self.RANGES[re.sub(r"_[23]$", "", name)], name)
 
     @abc.abstractmethod
     def coefficients(self, values: Values) -> Float[Tensor, "k n"]:
@@ -86,95 +93,8 @@ class AbstractMaterial(abc.ABC):
 
         It reads column p of coefficients and memory, writes all rows of column p of memory_next, and has an exact
         adjoint. dt = 0 and L = 0 give the rate-independent stress of the present state. The adjoint of a kernel does
-        not evaluate it again (`spectral.without_replay`), so a kernel does nothing with the two results but store them.
+        not evaluate it again (`tensors.replay`), so a kernel does nothing with the two results but store them.
         """
-
-
-@functools.cache
-def carried_strain(real: type) -> wp.Function:
-    """carried(p, row, M, memory) -> X_trial: the elastic strain X = b - I stored in six rows of column p, carried by
-    the increment I + M: b_trial = (I + M) b (I + M)^T."""
-    mat33 = spectral.matrix_type(real)
-
-    @wp.func(name=f"carried_strain_{real.__name__}")
-    def carried(p: int, row: int, M: mat33, memory: wp.array2d(dtype=real)):
-        xx, xy, xz = memory[row, p], memory[row + 1, p], memory[row + 2, p]
-        yy, yz, zz = memory[row + 3, p], memory[row + 4, p], memory[row + 5, p]
-        X = mat33(xx, xy, xz, xy, yy, yz, xz, yz, zz)
-        N = M + M * X
-        return X + N + wp.transpose(N) + N * wp.transpose(M)
-
-    return carried
-
-
-@functools.cache
-def store_strain(real: type) -> wp.Function:
-    """store(p, row, X, memory_next): the upper triangle of X, row by row, into six rows of column p."""
-    mat33 = spectral.matrix_type(real)
-
-    @wp.func(name=f"store_strain_{real.__name__}")
-    def store(p: int, row: int, X: mat33, memory_next: wp.array2d(dtype=real)):
-        memory_next[row, p] = X[0, 0]
-        memory_next[row + 1, p] = X[0, 1]
-        memory_next[row + 2, p] = X[0, 2]
-        memory_next[row + 3, p] = X[1, 1]
-        memory_next[row + 4, p] = X[1, 2]
-        memory_next[row + 5, p] = X[2, 2]
-
-    return spectral.without_replay(store)
-
-
-def log_strain(memory: Float[Tensor, "6 n"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
-    """Stored strain -> (principal values of dev ln V, ln J)."""
-    X = memory[[0, 1, 2, 1, 3, 4, 2, 4, 5]].T.reshape(-1, 3, 3)
-    x = torch.stack(spectral.principal_values(X), 1)
-    # below the floor of the stress along the tangent, as there: finite where round-off makes b < 0
-    floor = spectral._FLOOR
-    log_stretch = torch.where(1 + x > floor, torch.log1p(x.clamp(min=floor - 1)), math.log(floor) + (1 + x) / floor - 1)
-    log_stretch = log_stretch / 2
-    return log_stretch - log_stretch.mean(1, keepdim=True), log_stretch.sum(1)
-
-
-def hencky_energy(mu: Tensor, K: Tensor, memory: Float[Tensor, "6 n"]) -> Float[Tensor, " n"]:
-    """mu |dev eps|^2 + K/2 (tr eps)^2 [J/m^3] of the stored strain."""
-    dev, log_J = log_strain(memory)
-    return mu * (dev**2).sum(1) + K / 2 * log_J**2
-
-
-def check_names(values: Values, parameters: tuple[str, ...]) -> None:
-    """Raise ValueError unless `values` has exactly the names in `parameters`."""
-    missing, unknown = set(parameters) - set(values), set(values) - set(parameters)
-    if missing or unknown:
-        need = ", ".join(parameters)
-        raise ValueError(f"material parameters: missing {sorted(missing)}, unknown {sorted(unknown)}; needed: {need}")
-
-
-def check_range(values: Values, name: str, lowest: float, highest: float = math.inf, *, closed: bool = False) -> None:
-    """Raise ValueError unless lowest < values[name] < highest (closed: <=); NaN never passes."""
-    value = torch.as_tensor(values[name]).detach()
-    good = (value >= lowest) & (value <= highest) if closed else (value > lowest) & (value < highest)
-    if not bool(good.all()):
-        worst = value[~good].flatten()[0].item()
-        less = "<=" if closed else "<"
-        raise ValueError(f"{name} is {worst:g}; take {lowest:g} {less} {name} {less} {highest:g}")
-
-
-def check_elastic(values: Values) -> None:
-    """Raise ValueError unless youngs_modulus [Pa] is positive and poissons_ratio lies in (-1, 0.5)."""
-    check_range(values, "youngs_modulus", 0.0)
-    check_range(values, "poissons_ratio", -1.0, 0.5)
-
-
-def lame(youngs_modulus: Tensor, poissons_ratio: Tensor) -> tuple[Tensor, Tensor]:
-    """(mu, lam) [Pa] of Young's modulus [Pa] and Poisson's ratio."""
-    mu = youngs_modulus / (2 * (1 + poissons_ratio))
-    lam = youngs_modulus * poissons_ratio / ((1 + poissons_ratio) * (1 - 2 * poissons_ratio))
-    return mu, lam
-
-
-def rows(*values: Tensor) -> Float[Tensor, "k n"]:
-    """Stack scalars and per-particle values as rows of one matrix."""
-    return torch.stack(torch.broadcast_tensors(*(torch.atleast_1d(torch.as_tensor(value)) for value in values)))
 
 
 def coefficient_rows(material: AbstractMaterial) -> int:

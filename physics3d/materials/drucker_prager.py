@@ -11,18 +11,27 @@ elastic strain X = b_e - I lives in the memory, so that H is the total deformati
 import functools
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 import warp as wp
+from annotated_types import Gt, Lt
 from jaxtyping import Float
 from torch import Tensor
 
-from physics3d.materials import base, spectral
+from physics3d.materials.base import AbstractMaterial
+from physics3d.materials.parameters import ELASTIC, Values, lame, rows
+from physics3d.materials.strain_memory import carried_strain, hencky_energy, store_strain
+from physics3d.materials.tensors import log_strain, scalars
+from physics3d.materials.tensors.replay import without_replay
+from physics3d.warp_types import matrix
 
 
 @dataclass(frozen=True, kw_only=True)
-class DruckerPrager(base.AbstractMaterial):
+class DruckerPrager(AbstractMaterial):
     """Parameters: youngs_modulus [Pa], poissons_ratio, friction_angle [rad]."""
+
+    RANGES = ELASTIC | {"friction_angle": Annotated[float, Gt(0), Lt(math.pi / 2)]}
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -36,16 +45,11 @@ class DruckerPrager(base.AbstractMaterial):
     def memory_rows(self) -> int:
         return 7
 
-    def check_parameters(self, values: base.Values) -> None:
-        base.check_names(values, self.parameters)
-        base.check_elastic(values)
-        base.check_range(values, "friction_angle", 0.0, math.pi / 2)
-
-    def coefficients(self, values: base.Values) -> Float[Tensor, "3 n"]:
+    def coefficients(self, values: Values) -> Float[Tensor, "3 n"]:
         self.check_parameters(values)
-        mu, lam = base.lame(values["youngs_modulus"], values["poissons_ratio"])
+        mu, lam = lame(values["youngs_modulus"], values["poissons_ratio"])
         sine = torch.sin(values["friction_angle"])
-        return base.rows(mu, lam + 2 / 3 * mu, math.sqrt(2 / 3) * 2 * sine / (3 - sine))
+        return rows(mu, lam + 2 / 3 * mu, math.sqrt(2 / 3) * 2 * sine / (3 - sine))
 
     def wave_modulus(self, coefficients: Float[Tensor, "3 n"]) -> Float[Tensor, " n"]:
         return coefficients[1] + 4 / 3 * coefficients[0]
@@ -54,7 +58,7 @@ class DruckerPrager(base.AbstractMaterial):
         self, coefficients: Float[Tensor, "3 n"], H: Float[Tensor, "n 3 3"], memory: Float[Tensor, "7 n"]
     ) -> Float[Tensor, " n"]:
         mu, K, _ = coefficients
-        return base.hencky_energy(mu, K, memory[:6])
+        return hencky_energy(mu, K, memory[:6])
 
     def advance(self, real: type) -> wp.Function:
         return _advance(real)
@@ -62,9 +66,9 @@ class DruckerPrager(base.AbstractMaterial):
 
 @functools.cache
 def _advance(real: type) -> wp.Function:
-    mat33 = spectral.matrix_type(real)
-    relax, carried, store = spectral.relax_hencky(real), base.carried_strain(real), base.store_strain(real)
-    expm1 = spectral.expm1(real)
+    mat33 = matrix(real)
+    rescale, carried, store = log_strain.rescale(real), carried_strain(real), store_strain(real)
+    expm1 = scalars.expm1(real)
     gone = real(60.0)  # e^-60: what is left of a strain that is given up
 
     @wp.func(name=f"drucker_prager_return_{real.__name__}")
@@ -97,13 +101,13 @@ def _advance(real: type) -> wp.Function:
         mu, K = coefficients[0, p], coefficients[1, p]
         X = carried(p, 0, M, memory)
         X = X + expm1(real(2.0) * memory[6, p] / real(3.0)) * (one + X)
-        eps, _unrelaxed = relax(X, real(0.0), real(0.0))
+        eps, _same = rescale(X, real(1.0), real(1.0), real(0.0), real(0.0))
         trace = wp.trace(eps)
         dev = eps - trace / real(3.0) * one
         d, v = shrinkage(dev, trace, mu, K, coefficients[2, p])
-        _half, X_next = relax(X, d, v)
+        _eps, X_next = rescale(X, real(1.0), real(1.0), expm1(-d), expm1(-v))
         store(p, 0, X_next, memory_next)
         memory_next[6, p] = wp.max(trace, real(0.0))
         return H + M + M * H, real(2.0) * mu * wp.exp(-d) * dev + K * wp.exp(-v) * trace * one
 
-    return spectral.without_replay(advance)
+    return without_replay(advance)

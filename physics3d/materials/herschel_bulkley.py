@@ -8,27 +8,46 @@ Flow relaxes the overstress z = q - tau_y alone: dz/dt = -mu (z/k)^(1/n). In clo
 
     z(t) = z_0 [1 + (m - 1) c]^(-1/(m - 1)),   c = mu t z_0^(m - 1) / k^m       m -> 1 (Bingham): z_0 e^-c
 
-exact for every dt. The relaxed strain is stored as X = b_e - I. The stress is that of the mean shear rate of flow over
-the step, q = tau_y + z_0 ((z_0 - z)/(z_0 c))^n: second order, and exact in steady flow however long the step (a half
-relaxed stress, as in a Maxwell branch, is not if dt mu/k is above one). Dissipation q g >= 0. Simo and Hughes,
-Computational Inelasticity (1998), sec. 1.7 and 2.7 (overstress); Yue et al. (2015) for the law in MPM.
+One step: the strain at the end of the last one, of overstress z_n, is set back to u z_n, carried by the flow to an
+overstress z_0, and left with the stress of the mean shear rate of flow over the step, z_n+1 = k ((z_0 - z(dt))/(mu
+dt))^n. A flow that goes on steadily comes from u z_n and ends there, z_n = k ((z_0 - u z_n)/(mu dt))^n: with c at z_n
+
+    u = c/(e^r - 1),   r = ln(1 + (m - 1) c y^(m-1))/(m - 1),   y = c/(1 - e^-r)          by Newton's method
+
+(for n = 1 it is g(c) of `tensors/decay.py`). Second order, whatever the steps, and exact in steady flow however long
+they are. Dissipation q g >= 0. X = b_e - I is stored. Simo and Hughes, Computational Inelasticity (1998), sec. 1.7 and
+2.7 (overstress); Yue et al. (2015) for the law in MPM.
 """
 
 import functools
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import warp as wp
+from annotated_types import Gt, Lt
 from jaxtyping import Float
 from torch import Tensor
 
-from physics3d.materials import base, spectral
+from physics3d.checks import Positive
+from physics3d.materials.base import AbstractMaterial
+from physics3d.materials.parameters import ELASTIC, Values, lame, rows
+from physics3d.materials.strain_memory import carry_strain, hencky_energy, load_strain, store_strain
+from physics3d.materials.tensors import log_strain, scalars
+from physics3d.materials.tensors.replay import without_replay
+from physics3d.warp_types import matrix
 
 
 @dataclass(frozen=True, kw_only=True)
-class HerschelBulkley(base.AbstractMaterial):
+class HerschelBulkley(AbstractMaterial):
     """Parameters: youngs_modulus [Pa], poissons_ratio, yield_stress tau_y [Pa] in shear, consistency k [Pa s^n],
     flow_index n (below 1: the faster, the thinner)."""
+
+    RANGES = ELASTIC | {
+        "yield_stress": Positive,
+        "consistency": Positive,
+        "flow_index": Annotated[float, Gt(0), Lt(2)],
+    }
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -48,17 +67,10 @@ class HerschelBulkley(base.AbstractMaterial):
     def memory_rows(self) -> int:
         return 6
 
-    def check_parameters(self, values: base.Values) -> None:
-        base.check_names(values, self.parameters)
-        base.check_elastic(values)
-        base.check_range(values, "yield_stress", 0.0)
-        base.check_range(values, "consistency", 0.0)
-        base.check_range(values, "flow_index", 0.0, 2.0)
-
-    def coefficients(self, values: base.Values) -> Float[Tensor, "5 n"]:
+    def coefficients(self, values: Values) -> Float[Tensor, "5 n"]:
         self.check_parameters(values)
-        mu, lam = base.lame(values["youngs_modulus"], values["poissons_ratio"])
-        return base.rows(mu, lam + 2 / 3 * mu, values["yield_stress"], values["consistency"], 1 / values["flow_index"])
+        mu, lam = lame(values["youngs_modulus"], values["poissons_ratio"])
+        return rows(mu, lam + 2 / 3 * mu, values["yield_stress"], values["consistency"], 1 / values["flow_index"])
 
     def wave_modulus(self, coefficients: Float[Tensor, "5 n"]) -> Float[Tensor, " n"]:
         return coefficients[1] + 4 / 3 * coefficients[0]
@@ -66,7 +78,7 @@ class HerschelBulkley(base.AbstractMaterial):
     def energy(
         self, coefficients: Float[Tensor, "5 n"], H: Float[Tensor, "n 3 3"], memory: Float[Tensor, "6 n"]
     ) -> Float[Tensor, " n"]:
-        return base.hencky_energy(coefficients[0], coefficients[1], memory)
+        return hencky_energy(coefficients[0], coefficients[1], memory)
 
     def advance(self, real: type) -> wp.Function:
         return _advance(real)
@@ -76,7 +88,7 @@ class HerschelBulkley(base.AbstractMaterial):
 def _decay(real: type) -> wp.Function:
     """decay(c, s) -> ln(1 + s c)/s, c itself for s = 0; at most `gone`, also where 1 + s c <= 0 (s < 0: the overstress
     is used up before the step ends)."""
-    log1p = spectral.log1p(real)
+    log1p = scalars.log1p(real)
     small = real(0.02 if real is wp.float32 else 0.003)  # y^6: 6e-11, 7e-16
     gone = real(60.0)
 
@@ -96,10 +108,46 @@ def _decay(real: type) -> wp.Function:
 
 
 @functools.cache
+def _rate(real: type) -> wp.Function:
+    """rate(c, s) -> r of the docstring, s = m - 1; the derivative is that of a last step of Newton's method."""
+    decay, expm1 = _decay(real), scalars.expm1(real)
+    gone = real(60.0)
+
+    @wp.func(name=f"herschel_bulkley_newton_{real.__name__}")
+    def newton(r: real, c: real, s: real):
+        y = c / -expm1(-r)
+        C = c * wp.pow(y, s)
+        f = r - decay(C, s)
+        slope = real(1.0)
+        if s * C > real(-1.0):
+            slope = real(1.0) + s * C / (expm1(r) * (real(1.0) + s * C))
+        return r - f / slope
+
+    @wp.func(name=f"herschel_bulkley_root_{real.__name__}")
+    def root(c: real, s: real):
+        r = real(2.0) * wp.log(real(0.5) * c + wp.sqrt(real(1.0) + real(0.25) * c * c))  # exact for s = 1
+        for _ in range(8):
+            r = wp.clamp(newton(r, c, s), real(0.1) * r, wp.min(real(10.0) * r, gone))
+        return r
+
+    @wp.func_grad(root)
+    def adj_root(c: real, s: real, adj_ret: real):
+        wp.adjoint[c] += real(0.0) * adj_ret
+
+    @wp.func(name=f"herschel_bulkley_rate_{real.__name__}")
+    def rate(c: real, s: real):
+        r = root(c, s)
+        return wp.min(newton(r, c, s), gone)
+
+    return rate
+
+
+@functools.cache
 def _advance(real: type) -> wp.Function:
-    mat33 = spectral.matrix_type(real)
-    relax, carried, store = spectral.relax_hencky(real), base.carried_strain(real), base.store_strain(real)
-    decay, expm1, log1p = _decay(real), spectral.expm1(real), spectral.log1p(real)
+    mat33 = matrix(real)
+    load, carry, store = load_strain(real), carry_strain(real), store_strain(real)
+    rescale, rate = log_strain.rescale(real), _rate(real)
+    decay, expm1, log1p = _decay(real), scalars.expm1(real), scalars.log1p(real)
     root2 = real(math.sqrt(2))
     most, least = real(80.0), real(1e-20)  # e^80 is still a float32
 
@@ -113,9 +161,8 @@ def _advance(real: type) -> wp.Function:
 
     @wp.func(name=f"herschel_bulkley_flow_{real.__name__}")
     def flow(dev: mat33, dt: real, mu: real, tau_y: real, k: real, m: real):
-        """-ln of the factors left of dev eps, in the stress and in what is stored."""
+        """-ln of the factor left of dev eps after the step that began with it."""
         mean = real(0.0)
-        full = real(0.0)
         size = wp.ddot(dev, dev)
         if dt > real(0.0) and real(2.0) * mu * mu * size > tau_y * tau_y:
             q = root2 * mu * wp.sqrt(size)
@@ -125,10 +172,25 @@ def _advance(real: type) -> wp.Function:
                 log_c = wp.log(dt * mu / k) + s * wp.log(z / k)
                 c = wp.exp(wp.min(log_c, most))
                 g = decay(c, s)
-                full = left(q, tau_y, z, g)
                 if c > least:
                     mean = left(q, tau_y, z, (log_c - wp.log(-expm1(-g))) / m)
-        return mean, full
+        return mean
+
+    @wp.func(name=f"herschel_bulkley_before_{real.__name__}")
+    def before(dev: mat33, dt: real, mu: real, tau_y: real, k: real, m: real):
+        """-ln of the factor by which dev eps of the last step is set back."""
+        back = real(0.0)
+        size = wp.ddot(dev, dev)
+        if dt > real(0.0) and real(2.0) * mu * mu * size > tau_y * tau_y:
+            q = root2 * mu * wp.sqrt(size)
+            z = q - tau_y
+            if z > real(0.0):
+                s = m - real(1.0)
+                c = wp.exp(wp.min(wp.log(dt * mu / k) + s * wp.log(z / k), most))
+                if c > least:
+                    r = rate(c, s)
+                    back = left(q, tau_y, z, -wp.log(c / expm1(r)))
+        return back
 
     @wp.func(name=f"herschel_bulkley_{real.__name__}")
     def advance(
@@ -143,13 +205,18 @@ def _advance(real: type) -> wp.Function:
         one = wp.identity(n=3, dtype=real)
         M = dt * L
         mu, K = coefficients[0, p], coefficients[1, p]
-        X = carried(p, 0, M, memory)
-        eps, _unrelaxed = relax(X, real(0.0), real(0.0))
+        tau_y, k, m = coefficients[2, p], coefficients[3, p], coefficients[4, p]
+        X_n = load(p, 0, memory)
+        eps_n, _same = rescale(X_n, real(1.0), real(1.0), real(0.0), real(0.0))
+        back = before(eps_n - wp.trace(eps_n) / real(3.0) * one, dt, mu, tau_y, k, m)
+        _eps_n, X_back = rescale(X_n, real(1.0), real(1.0), expm1(-back), real(0.0))
+        X = carry(X_back, M)
+        eps, _same = rescale(X, real(1.0), real(1.0), real(0.0), real(0.0))
         mean = wp.trace(eps) / real(3.0)
         dev = eps - mean * one
-        relaxed, full = flow(dev, dt, mu, coefficients[2, p], coefficients[3, p], coefficients[4, p])
-        _half, X_next = relax(X, full, real(0.0))
+        relaxed = flow(dev, dt, mu, tau_y, k, m)
+        _eps, X_next = rescale(X, real(1.0), real(1.0), expm1(-relaxed), real(0.0))
         store(p, 0, X_next, memory_next)
         return H + M + M * H, real(2.0) * mu * wp.exp(-relaxed) * dev + real(3.0) * K * mean * one
 
-    return spectral.without_replay(advance)
+    return without_replay(advance)

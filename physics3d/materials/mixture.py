@@ -15,19 +15,22 @@ import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from physics3d.materials import base, spectral
+from physics3d.materials.base import AbstractMaterial, coefficient_rows
+from physics3d.materials.parameters import Values, check_names
+from physics3d.materials.tensors.replay import without_replay
+from physics3d.warp_types import matrix
 
 PART = "part"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Mixture(base.AbstractMaterial):
+class Mixture(AbstractMaterial):
     """Parameters: those of every material, each behind the name of its part and a dot.
 
     Raises ValueError if there is no material, a name holds a dot, or a mixture is in the mixture.
     """
 
-    materials: Mapping[str, base.AbstractMaterial]  # name of the part -> its material
+    materials: Mapping[str, AbstractMaterial]  # name of the part -> its material
 
     def __post_init__(self) -> None:
         if not self.materials:
@@ -47,15 +50,19 @@ class Mixture(base.AbstractMaterial):
         return {f"{part}.{name}": x for part, m in self.materials.items() for name, x in m.example.items()}
 
     @property
+    def recovers(self) -> bool:
+        return all(m.recovers for m in self.materials.values())
+
+    @property
     def memory_rows(self) -> int:
         return max(m.memory_rows for m in self.materials.values())
 
     @property
-    def _kinds(self) -> tuple[base.AbstractMaterial, ...]:
+    def _kinds(self) -> tuple[AbstractMaterial, ...]:
         """The different models."""
         return tuple(dict.fromkeys(self.materials.values()))
 
-    def per_part(self, values: base.Values, part: Int[Tensor, " n"], parts: tuple[str, ...]) -> base.Values:
+    def per_part(self, values: Values, part: Int[Tensor, " n"], parts: tuple[str, ...]) -> Values:
         if set(parts) != set(self.materials):
             raise ValueError(
                 f"the parts of the body are {sorted(parts)}, materials are given for {sorted(self.materials)}; give "
@@ -65,19 +72,19 @@ class Mixture(base.AbstractMaterial):
         index = torch.tensor([order.index(name) for name in parts], device=part.device)
         return values | {PART: index[part.long()]}
 
-    def check_parameters(self, values: base.Values) -> None:
+    def check_parameters(self, values: Values) -> None:
         """The part need not be there yet."""
-        base.check_names({name: x for name, x in values.items() if name != PART}, self.parameters)
+        check_names({name: x for name, x in values.items() if name != PART}, self.parameters)
         for part, material in self.materials.items():
             try:
                 material.check_parameters(self._of(part, values))
             except ValueError as error:
                 raise ValueError(f"{part}.{error}") from error
 
-    def _of(self, part: str, values: base.Values) -> base.Values:
+    def _of(self, part: str, values: Values) -> Values:
         return {name: values[f"{part}.{name}"] for name in self.materials[part].parameters}
 
-    def coefficients(self, values: base.Values) -> Float[Tensor, "k n"]:
+    def coefficients(self, values: Values) -> Float[Tensor, "k n"]:
         """Raises ValueError also if values[part] is missing or no index of a material."""
         self.check_parameters(values)
         if PART not in values:
@@ -122,7 +129,7 @@ class Mixture(base.AbstractMaterial):
         for i, material in enumerate(self._kinds):
             at = torch.nonzero(coefficients[-1] == i)[:, 0]
             if len(at):
-                own = coefficients[: base.coefficient_rows(material), at]
+                own = coefficients[: coefficient_rows(material), at]
                 found = found.index_put((at,), function(material, own, *(x[..., at] for x in others)))
         return found
 
@@ -144,7 +151,7 @@ def _either(
     """`own` for particles of this number, `other` for the rest; memory beyond that of the model is left as it is.
 
     Models are chained, not listed: Warp's cache of kernels does not see a function behind a static index."""
-    mat33 = spectral.matrix_type(real)
+    mat33 = matrix(real)
 
     @wp.func(name=f"{own.key}_or_{other.key}")
     def advance(
@@ -166,4 +173,4 @@ def _either(
         H_next, tau = other(p, dt, L, H, coefficients, memory, memory_next)
         return H_next, tau
 
-    return spectral.without_replay(advance)
+    return without_replay(advance)

@@ -1,7 +1,12 @@
 """Weakly compressible fluid, Newtonian or power-law: water, honey, ketchup above its yield.
 
-    tau = K J (J - 1) I + 2 eta J dev D,   D = sym L                                [Pa]
+    tau = K J (J - 1) I + 2 eta J dev D                                             [Pa]
     eta = k g^(n - 1),   g^2 = 2 dev D : dev D + g_0^2,   g_0 = 1e-3 1/s            n = 1: Newtonian, eta = k
+    D   = (B - B^-1)/(4 dt),   B = (I + dt L)(I + dt L)^T                           [1/s]
+
+D is the rate of deformation of a finite step: sym L for a short one, nothing for a rotation however large, turning
+with whoever turns, exact in shear. It stands as the body does at the end of the step, so that a sheared fluid has
+normal stresses of +-eta dt/2 times the square of the shear rate.
 
 J is integrated by itself, (J - 1)_next from det(I + dt L): the determinant of a long-sheared F would lose it. A viscous
 explicit step needs dt < rho dx^2 / (6 eta) besides the sound-speed limit. Bird, Armstrong, Hassager (1987), sec. 4.1.
@@ -9,20 +14,29 @@ explicit step needs dt < rho dx^2 / (6 eta) besides the sound-speed limit. Bird,
 
 import functools
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 import warp as wp
+from annotated_types import Ge, Le
 from jaxtyping import Float
 from torch import Tensor
 
-from physics3d.materials import base, spectral
+from physics3d.checks import NotNegative, Positive
+from physics3d.materials.base import AbstractMaterial
+from physics3d.materials.parameters import Values, rows
+from physics3d.materials.tensors import volume
+from physics3d.materials.tensors.replay import without_replay
+from physics3d.warp_types import matrix
 
 _LEAST_RATE = 1e-3  # g_0 [1/s]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Newtonian(base.AbstractMaterial):
+class Newtonian(AbstractMaterial):
     """Parameters: bulk_modulus [Pa], viscosity k [Pa s^n], power_index n."""
+
+    RANGES = {"bulk_modulus": Positive, "viscosity": NotNegative, "power_index": Annotated[float, Ge(0), Le(2)]}
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -36,15 +50,9 @@ class Newtonian(base.AbstractMaterial):
     def memory_rows(self) -> int:
         return 1
 
-    def check_parameters(self, values: base.Values) -> None:
-        base.check_names(values, self.parameters)
-        base.check_range(values, "bulk_modulus", 0.0)
-        base.check_range(values, "viscosity", 0.0, closed=True)
-        base.check_range(values, "power_index", 0.0, 2.0, closed=True)
-
-    def coefficients(self, values: base.Values) -> Float[Tensor, "3 n"]:
+    def coefficients(self, values: Values) -> Float[Tensor, "3 n"]:
         self.check_parameters(values)
-        return base.rows(*(values[name] for name in self.parameters))
+        return rows(*(values[name] for name in self.parameters))
 
     def wave_modulus(self, coefficients: Float[Tensor, "3 n"]) -> Float[Tensor, " n"]:
         return coefficients[0]
@@ -66,9 +74,23 @@ class Newtonian(base.AbstractMaterial):
 
 @functools.cache
 def _advance(real: type) -> wp.Function:
-    mat33 = spectral.matrix_type(real)
-    volume_change = spectral.volume_change(real)
+    mat33 = matrix(real)
+    carried_volume = volume.carried_volume(real)
     least2 = real(_LEAST_RATE**2)
+
+    cofactor, round_off = volume.cofactor(real), real(5e-7 if real is wp.float32 else 1e-15)
+
+    @wp.func(name=f"rate_of_deformation_{real.__name__}")
+    def rate(dt: real, L: mat33, M: mat33):
+        D = real(0.5) * (L + wp.transpose(L))
+        if dt > real(0.0):
+            X = M + wp.transpose(M) + M * wp.transpose(M)
+            B = wp.identity(n=3, dtype=real) + X
+            C = cofactor(B)
+            # finite where the step flattens the body, or stretches it so unequally that rounding takes the determinant
+            least = wp.max(real(1e-12), round_off * wp.sqrt(wp.ddot(B, B)) * wp.sqrt(wp.ddot(C, C)))
+            D = (X + X * (C / wp.max(wp.determinant(B), least))) / (real(4.0) * dt)
+        return D
 
     @wp.func(name=f"newtonian_{real.__name__}")
     def advance(
@@ -82,12 +104,13 @@ def _advance(real: type) -> wp.Function:
     ):
         one = wp.identity(n=3, dtype=real)
         M = dt * L
-        j = memory[0, p] + (real(1.0) + memory[0, p]) * volume_change(M)
+        j = carried_volume(memory[0, p], M)
         memory_next[0, p] = j
         J = real(1.0) + j
-        D = real(0.5) * (L + wp.transpose(L)) - wp.trace(L) / real(3.0) * one
+        D = rate(dt, L, M)
+        D = D - wp.trace(D) / real(3.0) * one
         g2 = real(2.0) * wp.ddot(D, D) + least2
         eta = coefficients[1, p] * wp.pow(g2, real(0.5) * (coefficients[2, p] - real(1.0)))
         return H + M + M * H, coefficients[0, p] * J * j * one + real(2.0) * eta * wp.max(J, real(0.0)) * D
 
-    return spectral.without_replay(advance)
+    return without_replay(advance)

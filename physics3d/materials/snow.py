@@ -15,19 +15,33 @@ X = b_e - I and ln J_P live in the memory, so that H is the total deformation.
 
 import functools
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 import warp as wp
+from annotated_types import Gt, Lt
 from jaxtyping import Float
 from torch import Tensor
 
-from physics3d.materials import base, spectral
+from physics3d.checks import NotNegative, Positive
+from physics3d.materials.base import AbstractMaterial
+from physics3d.materials.parameters import ELASTIC, Values, lame, rows
+from physics3d.materials.strain_memory import carried_strain, hencky_energy, store_strain
+from physics3d.materials.tensors import return_maps, scalars
+from physics3d.materials.tensors.replay import without_replay
+from physics3d.warp_types import matrix
 
 
 @dataclass(frozen=True, kw_only=True)
-class Snow(base.AbstractMaterial):
+class Snow(AbstractMaterial):
     """Parameters: youngs_modulus [Pa], poissons_ratio, critical_compression theta_c, critical_stretch theta_s,
     hardening xi."""
+
+    RANGES = ELASTIC | {
+        "critical_compression": Annotated[float, Gt(0), Lt(1)],
+        "critical_stretch": Positive,
+        "hardening": NotNegative,
+    }
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -47,12 +61,8 @@ class Snow(base.AbstractMaterial):
     def memory_rows(self) -> int:
         return 7
 
-    def check_parameters(self, values: base.Values) -> None:
-        base.check_names(values, self.parameters)
-        base.check_elastic(values)
-        base.check_range(values, "critical_compression", 0.0, 1.0)
-        base.check_range(values, "critical_stretch", 0.0)
-        base.check_range(values, "hardening", 0.0, closed=True)
+    def check_parameters(self, values: Values) -> None:
+        super().check_parameters(values)
         with torch.no_grad():
             mu, K, lower, upper, xi = self._rows(values)
             widest = torch.maximum(-lower, upper) ** 2 / -lower
@@ -64,14 +74,14 @@ class Snow(base.AbstractMaterial):
                 f"{limit[worst]:g}, or a smaller critical_compression and critical_stretch"
             )
 
-    def coefficients(self, values: base.Values) -> Float[Tensor, "5 n"]:
+    def coefficients(self, values: Values) -> Float[Tensor, "5 n"]:
         self.check_parameters(values)
         return self._rows(values)
 
-    def _rows(self, values: base.Values) -> Float[Tensor, "5 n"]:
-        mu, lam = base.lame(values["youngs_modulus"], values["poissons_ratio"])
+    def _rows(self, values: Values) -> Float[Tensor, "5 n"]:
+        mu, lam = lame(values["youngs_modulus"], values["poissons_ratio"])
         lower, upper = torch.log1p(-values["critical_compression"]), torch.log1p(values["critical_stretch"])
-        return base.rows(mu, lam + 2 / 3 * mu, lower, upper, values["hardening"])
+        return rows(mu, lam + 2 / 3 * mu, lower, upper, values["hardening"])
 
     def wave_modulus(self, coefficients: Float[Tensor, "5 n"]) -> Float[Tensor, " n"]:
         return coefficients[1] + 4 / 3 * coefficients[0]
@@ -83,7 +93,7 @@ class Snow(base.AbstractMaterial):
         self, coefficients: Float[Tensor, "5 n"], H: Float[Tensor, "n 3 3"], memory: Float[Tensor, "7 n"]
     ) -> Float[Tensor, " n"]:
         mu, K = coefficients[:2]
-        return self.stiffening(coefficients, memory) * base.hencky_energy(mu, K, memory[:6])
+        return self.stiffening(coefficients, memory) * hencky_energy(mu, K, memory[:6])
 
     def advance(self, real: type) -> wp.Function:
         return _advance(real)
@@ -91,9 +101,9 @@ class Snow(base.AbstractMaterial):
 
 @functools.cache
 def _advance(real: type) -> wp.Function:
-    mat33 = spectral.matrix_type(real)
-    box, carried, store = spectral.box_hencky(real), base.carried_strain(real), base.store_strain(real)
-    expm1 = spectral.expm1(real)
+    mat33 = matrix(real)
+    box, carried, store = return_maps.box_hencky(real), carried_strain(real), store_strain(real)
+    expm1 = scalars.expm1(real)
     third, most = real(1 / 3), real(60.0)  # e^60 is still a float32
 
     @wp.func(name=f"snow_{real.__name__}")
@@ -118,4 +128,4 @@ def _advance(real: type) -> wp.Function:
         mean = wp.trace(eps) * third
         return H + M + M * H, h * (real(2.0) * mu * (eps - mean * one) + real(3.0) * K * mean * one)
 
-    return spectral.without_replay(advance)
+    return without_replay(advance)

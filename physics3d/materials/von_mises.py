@@ -15,12 +15,20 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
-from physics3d.materials import base, spectral
+from physics3d.checks import NotNegative, Positive
+from physics3d.materials.base import AbstractMaterial
+from physics3d.materials.parameters import ELASTIC, Values, lame, rows
+from physics3d.materials.strain_memory import carried_strain, hencky_energy, store_strain
+from physics3d.materials.tensors import log_strain, scalars
+from physics3d.materials.tensors.replay import without_replay
+from physics3d.warp_types import matrix
 
 
 @dataclass(frozen=True, kw_only=True)
-class VonMises(base.AbstractMaterial):
+class VonMises(AbstractMaterial):
     """Parameters: youngs_modulus [Pa], poissons_ratio, yield_stress [Pa] in tension, hardening_modulus [Pa]."""
+
+    RANGES = ELASTIC | {"yield_stress": Positive, "hardening_modulus": NotNegative}
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -34,16 +42,10 @@ class VonMises(base.AbstractMaterial):
     def memory_rows(self) -> int:
         return 7
 
-    def check_parameters(self, values: base.Values) -> None:
-        base.check_names(values, self.parameters)
-        base.check_elastic(values)
-        base.check_range(values, "yield_stress", 0.0)
-        base.check_range(values, "hardening_modulus", 0.0, closed=True)
-
-    def coefficients(self, values: base.Values) -> Float[Tensor, "4 n"]:
+    def coefficients(self, values: Values) -> Float[Tensor, "4 n"]:
         self.check_parameters(values)
-        mu, lam = base.lame(values["youngs_modulus"], values["poissons_ratio"])
-        return base.rows(mu, lam + 2 / 3 * mu, values["yield_stress"], values["hardening_modulus"])
+        mu, lam = lame(values["youngs_modulus"], values["poissons_ratio"])
+        return rows(mu, lam + 2 / 3 * mu, values["yield_stress"], values["hardening_modulus"])
 
     def wave_modulus(self, coefficients: Float[Tensor, "4 n"]) -> Float[Tensor, " n"]:
         return coefficients[1] + 4 / 3 * coefficients[0]
@@ -53,7 +55,7 @@ class VonMises(base.AbstractMaterial):
     ) -> Float[Tensor, " n"]:
         """With the energy stored in hardening."""
         mu, K, _, h = coefficients
-        return base.hencky_energy(mu, K, memory[:6]) + h / 2 * memory[6] ** 2
+        return hencky_energy(mu, K, memory[:6]) + h / 2 * memory[6] ** 2
 
     def advance(self, real: type) -> wp.Function:
         return _advance(real)
@@ -61,9 +63,9 @@ class VonMises(base.AbstractMaterial):
 
 @functools.cache
 def _advance(real: type) -> wp.Function:
-    mat33 = spectral.matrix_type(real)
-    relax, carried, store = spectral.relax_hencky(real), base.carried_strain(real), base.store_strain(real)
-    root = real((2 / 3) ** 0.5)
+    mat33 = matrix(real)
+    rescale, carried, store = log_strain.rescale(real), carried_strain(real), store_strain(real)
+    expm1, root = scalars.expm1(real), real((2 / 3) ** 0.5)
 
     @wp.func(name=f"von_mises_return_{real.__name__}")
     def plastic_increment(dev: mat33, alpha: real, mu: real, sigma_y: real, h: real):
@@ -92,13 +94,13 @@ def _advance(real: type) -> wp.Function:
         M = dt * L
         mu = coefficients[0, p]
         X = carried(p, 0, M, memory)
-        eps, _unrelaxed = relax(X, real(0.0), real(0.0))
+        eps, _same = rescale(X, real(1.0), real(1.0), real(0.0), real(0.0))
         mean = wp.trace(eps) / real(3.0)
         gained, shrink = plastic_increment(eps - mean * one, memory[6, p], mu, coefficients[2, p], coefficients[3, p])
-        _half, X_next = relax(X, shrink, real(0.0))
+        _eps, X_next = rescale(X, real(1.0), real(1.0), expm1(-shrink), real(0.0))
         store(p, 0, X_next, memory_next)
         memory_next[6, p] = memory[6, p] + gained
         tau = real(2.0) * mu * wp.exp(-shrink) * (eps - mean * one) + real(3.0) * coefficients[1, p] * mean * one
         return H + M + M * H, tau
 
-    return spectral.without_replay(advance)
+    return without_replay(advance)

@@ -1,0 +1,1 @@
+"""How near a video is to another: pictures, motion, and the table of scores."""

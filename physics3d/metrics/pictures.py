@@ -3,7 +3,7 @@
 from jaxtyping import UInt8
 from torch import Tensor
 
-from physics3d.video import space_time_slice
+from physics3d.pictures import space_time_slice
 
 
 def slices(names: list[str], clips: list[UInt8[Tensor, "t h w 3"]], row: int, column: int):

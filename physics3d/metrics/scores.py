@@ -5,6 +5,7 @@ from typing import Any
 
 from physics3d.artifact import AbstractArtifact
 
+FROZEN, REFERENCE = "frozen first frame", "reference"  # rows that everyone is compared with
 UNITS = {
     "psnr": "PSNR [dB]", "ssim": "SSIM", "ms_ssim": "MS-SSIM", "vmaf": "VMAF", "motion_psnr": "motion PSNR [dB]",
     "flow_error": "flow error", "frequency": "frequency [Hz]", "damping": "damping [1/s]",

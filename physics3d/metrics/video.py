@@ -5,7 +5,6 @@ motion that is not the reference's; like the others it can be fooled by a still 
 """
 
 import json
-import subprocess
 import tempfile
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from physics3d.metrics.image import check_pair
-from physics3d.video import ffmpeg
+from physics3d.video import run_ffmpeg
 
 SMALLEST = 32  # [px]
 
@@ -24,12 +23,8 @@ def vmaf(video: UInt8[Tensor, "t h w 3"], reference: UInt8[Tensor, "t h w 3"]) -
     h, w = video.shape[1:3]
     if min(h, w) < SMALLEST:
         return None, f"VMAF needs both sides >= {SMALLEST} px, the pictures are {w} x {h}"
-    try:
-        program = ffmpeg()
-    except RuntimeError as error:
-        return None, str(error)
     with tempfile.TemporaryDirectory() as folder:
-        command = [program, "-hide_banner", "-loglevel", "error", "-nostdin"]
+        command = []
         for name, frames in (("distorted", video), ("reference", reference)):  # libvmaf wants them in this order
             (Path(folder) / name).write_bytes(frames.contiguous().numpy().tobytes())
             command += ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{w}x{h}", "-r", "25", "-i", name]
@@ -37,9 +32,9 @@ def vmaf(video: UInt8[Tensor, "t h w 3"], reference: UInt8[Tensor, "t h w 3"]) -
             "[0:v]format=yuv444p[d];[1:v]format=yuv444p[r];[d][r]libvmaf=log_fmt=json:log_path=vmaf.json:n_threads=2"
         )
         command += ["-lavfi", graph, "-f", "null", "-"]
-        done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
-        if done.returncode:
-            lines = done.stderr.strip().splitlines()
-            return None, f"VMAF: ffmpeg failed ({lines[-1] if lines else done.returncode}); it may lack libvmaf"
+        try:
+            run_ffmpeg(command, folder=Path(folder))
+        except RuntimeError as error:
+            return None, f"VMAF: {error}; its libvmaf may be missing"
         pooled = json.loads((Path(folder) / "vmaf.json").read_text())["pooled_metrics"]
     return float(pooled["vmaf"]["mean"]) / 100, ""

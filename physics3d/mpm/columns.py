@@ -2,6 +2,7 @@
 
     gathered(v, ...)        rows sum w v, sum w v r_x, sum w v r_y, sum w v r_z                 r = x_i - x_p [cells]
     spread(grid, ...)       node += w (q + A r, m)
+    spread_vectors(grid, ...)  node += w (q + A r)
     spread_adjoint(G, ...)  with (P, M) of a node: rows of `gathered` for (P, M), then sum grad w [P . (q + A r) + m M]
     gathered_adjoint(v, ...)  node += w (V + B r);  rows sum w v, sum grad w [v . (V + B r)]
 
@@ -146,6 +147,31 @@ def spread(real, fast: bool) -> wp.Function:
                     weight = wij * w[2, k]
                     value = vec4(weight * qijk[0], weight * qijk[1], weight * qijk[2], weight * m)
                     wp.atomic_add(grid, node + (i * ny + j) * nz + k, value)
+                    qijk = qijk + az
+                qij = qij + ay
+            qi = qi + ax
+
+    return plain
+
+
+@cache
+def spread_vectors(real) -> wp.Function:
+    """spread_vectors(grid: array[vec3], first node, ny, nz, w, q, A): `spread` without mass, in the plain form only."""
+    vec3, mat33 = _vector(real, 3), wp.types.matrix((3, 3), real)
+
+    @wp.func
+    def plain(grid: wp.array(dtype=vec3), node: int, ny: int, nz: int, w: mat33, q: vec3, A: mat33):
+        ax = vec3(A[0, 0], A[1, 0], A[2, 0])
+        ay = vec3(A[0, 1], A[1, 1], A[2, 1])
+        az = vec3(A[0, 2], A[1, 2], A[2, 2])
+        qi = q
+        for i in range(3):
+            qij = qi
+            for j in range(3):
+                wij = w[0, i] * w[1, j]
+                qijk = qij
+                for k in range(3):
+                    wp.atomic_add(grid, node + (i * ny + j) * nz + k, (wij * w[2, k]) * qijk)
                     qijk = qijk + az
                 qij = qij + ay
             qi = qi + ax

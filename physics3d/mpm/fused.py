@@ -1,8 +1,8 @@
 """All that a substep does to a particle in one pass: gather, steer, advance, push, and the scatter of the next one.
 
 What lies between these (velocity, its gradient, stress) never goes through memory, and a particle's numbers are read
-once. Only the CPU takes it: the kernels of `transfer` and `substep` are its twins and what CUDA runs, and the adjoint
-is theirs. A test holds the two together. States may be the same (in place) or not.
+once. Only the CPU takes it: the kernels of `transfer`, `push`, `steer` and `advance` are its twins and what CUDA runs,
+and the adjoint is theirs. A test holds the two together. States may be the same (in place) or not.
 """
 
 from functools import cache
@@ -10,20 +10,19 @@ from functools import cache
 import warp as wp
 
 from physics3d.mpm import columns
-from physics3d.mpm.transfer import stencil
+from physics3d.mpm.hooks import Hook, columns_of
+from physics3d.mpm.stencil import stencil
 from physics3d.warp_types import matrix, vector, vector4
-
-Hook = tuple[wp.Function, int, int, int]  # function, first parameter, first signal, row of the selection
 
 
 @cache
 def particle_pass(real, material: wp.Function, pushes: tuple[Hook, ...], steers: tuple[Hook, ...]) -> wp.Kernel:
     """Kernel: from the node velocities of substep `row` to the momentum of the next one."""
     vec3, vec4, mat33 = vector(real), vector4(real), matrix(real)
-    base, local, weights, _ = stencil(real)
+    first_node, local, weights, _ = stencil(real)
     gathered, spread = columns.gathered(real, fast=True), columns.spread(real, fast=True)
-    push, push_a, push_b, push_row = zip(*pushes) if pushes else ((), (), (), ())
-    steer, steer_a, steer_b, steer_row = zip(*steers) if steers else ((), (), (), ())
+    push, push_a, push_b, push_row = columns_of(pushes)
+    steer, steer_a, steer_b, steer_row = columns_of(steers)
     push_count, steer_count = len(pushes), len(steers)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -31,49 +30,46 @@ def particle_pass(real, material: wp.Function, pushes: tuple[Hook, ...], steers:
         # in
         first: int,  # particle of thread 0
         dx: real,  # [m]
-        window: wp.array(dtype=int),
-        clock: wp.array2d(dtype=real),
-        row: wp.array(dtype=int),
+        window: wp.array(dtype=int),  # [6] lowest node and number of nodes along each axis
+        clock: wp.array2d(dtype=real),  # [substep, k] dt [s], exp(-damping dt), signals of the boundaries
+        row: wp.array(dtype=int),  # [1] the substep
         keep: int,  # 1: write velocities and stress too
         onward: int,  # 1: scatter for the next substep
         selection: wp.array2d(dtype=real),  # [boundary, p]
         rest: wp.array(dtype=vec3),  # [p] [m]
-        q: wp.array(dtype=real),
-        mass: wp.array(dtype=real),
-        volume: wp.array(dtype=real),
-        cell: wp.array(dtype=wp.vec3i),
-        offset: wp.array(dtype=vec3),
-        coefficients: wp.array2d(dtype=real),
+        q: wp.array(dtype=real),  # [k] parameters of the boundaries
+        mass: wp.array(dtype=real),  # [p] [kg]
+        volume: wp.array(dtype=real),  # [p] at rest [m^3]
+        cell: wp.array(dtype=wp.vec3i),  # [p] of the rest position
+        offset: wp.array(dtype=vec3),  # [p] of the rest position in its cell [cells]
+        coefficients: wp.array2d(dtype=real),  # [k, p] of the material
         node_velocity: wp.array(dtype=vec3),  # [node] [m/s]
-        u: wp.array(dtype=vec3),
-        H: wp.array(dtype=mat33),
-        memory: wp.array2d(dtype=real),
+        u: wp.array(dtype=vec3),  # [p] displacement [m]
+        H: wp.array(dtype=mat33),  # [p] F - I [1]
+        memory: wp.array2d(dtype=real),  # [m, p] internal variables of the material
         # out
-        u_next: wp.array(dtype=vec3),
-        H_next: wp.array(dtype=mat33),
-        memory_next: wp.array2d(dtype=real),
-        v_gathered: wp.array(dtype=vec3),
-        L_gathered: wp.array(dtype=mat33),
-        v_next: wp.array(dtype=vec3),
-        L_next: wp.array(dtype=mat33),
-        tau_next: wp.array(dtype=mat33),
+        u_next: wp.array(dtype=vec3),  # [p] [m]
+        H_next: wp.array(dtype=mat33),  # [p] [1]
+        memory_next: wp.array2d(dtype=real),  # [m, p]
+        v_gathered: wp.array(dtype=vec3),  # [p] before steering [m/s]
+        L_gathered: wp.array(dtype=mat33),  # [p] before steering [1/s]
+        v_next: wp.array(dtype=vec3),  # [p] [m/s]
+        L_next: wp.array(dtype=mat33),  # [p] [1/s]
+        tau_next: wp.array(dtype=mat33),  # [p] Kirchhoff stress [Pa]
         grid: wp.array(dtype=vec4),  # [node] momentum [kg m/s], mass [kg], added to
         lost: wp.array(dtype=int),  # [1] added to
     ):
         p = wp.tid() + first
         r = row[0]
         dt = clock[r, 0]
-        zero = real(0.0)
-        nx, ny, nz = window[3], window[4], window[5]
+        ny, nz = window[4], window[5]
         place = u[p]
         d = offset[p] + place / dx
-        corner = base(cell[p], d)
-        ix, iy, iz = corner[0] - real(window[0]), corner[1] - real(window[1]), corner[2] - real(window[2])
-        inside = ix >= zero and iy >= zero and iz >= zero and ix <= real(nx - 3) and iy <= real(ny - 3)
-        if inside and iz <= real(nz - 3):
+        node = first_node(cell[p], d, window)
+        if node >= 0:
             f = local(d)
             w = weights(f)
-            S = gathered(node_velocity, (int(ix) * ny + int(iy)) * nz + int(iz), ny, nz, f, w)
+            S = gathered(node_velocity, node, ny, nz, f, w)
             v = vec3(S[0, 0], S[0, 1], S[0, 2])
             L = (real(4.0) / dx) * mat33(
                 S[1, 0], S[2, 0], S[3, 0], S[1, 1], S[2, 1], S[3, 1], S[1, 2], S[2, 2], S[3, 2]
@@ -85,7 +81,7 @@ def particle_pass(real, material: wp.Function, pushes: tuple[Hook, ...], steers:
                 x = rest[p] + place
                 for i in range(wp.static(steer_count)):
                     weight = selection[wp.static(steer_row[i]), p]
-                    if weight != zero:
+                    if weight != real(0.0):
                         v, L = wp.static(steer[i])(
                             weight, x, v, L, q, wp.static(steer_a[i]), clock, r, wp.static(steer_b[i])
                         )
@@ -105,21 +101,18 @@ def particle_pass(real, material: wp.Function, pushes: tuple[Hook, ...], steers:
                     pushed = v
                     for i in range(wp.static(push_count)):
                         weight = selection[wp.static(push_row[i]), p]
-                        if weight != zero:
+                        if weight != real(0.0):
                             pushed = pushed + dt * wp.static(push[i])(
                                 weight, x, q, wp.static(push_a[i]), clock, r, wp.static(push_b[i])
                             )
                     v = pushed
                 d = offset[p] + place / dx
-                corner = base(cell[p], d)
-                ix, iy, iz = corner[0] - real(window[0]), corner[1] - real(window[1]), corner[2] - real(window[2])
-                inside = ix >= zero and iy >= zero and iz >= zero and ix <= real(nx - 3) and iy <= real(ny - 3)
-                if inside and iz <= real(nz - 3):
+                node = first_node(cell[p], d, window)
+                if node >= 0:
                     f = local(d)
                     m = mass[p]
                     A = (m * dx) * L - (real(4.0) * dt * volume[p] / dx) * stress
-                    first_node = (int(ix) * ny + int(iy)) * nz + int(iz)
-                    spread(grid, first_node, ny, nz, weights(f), m * v - A * f, m, A)
+                    spread(grid, node, ny, nz, weights(f), m * v - A * f, m, A)
                 else:
                     wp.atomic_add(lost, 0, 1)
         else:

@@ -5,6 +5,7 @@ same bytes.
 """
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 import warp as wp
@@ -26,7 +27,7 @@ class State:
     memory: Tensor  # internal variables [m, n]
     v_gathered: Tensor  # before steering [n, 3]; the same memory as v unless something steers
     L_gathered: Tensor  # [n, 3, 3], likewise
-    warp: dict[str, wp.array] = field(repr=False)  # the same arrays for Warp
+    warp: dict[str, Any] = field(repr=False)  # the same arrays for Warp
 
 
 def make_state(n: int, memory_rows: int, *, steered: bool, dtype: torch.dtype, device: str | torch.device) -> State:

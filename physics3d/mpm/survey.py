@@ -34,16 +34,16 @@ def _survey(real) -> wp.Kernel:
     @wp.kernel(module="unique", enable_backward=False)
     def survey_kernel(
         # in
-        dx: real,
+        dx: real,  # [m]
         lower: vec3,  # of the region [m]
-        upper: vec3,
+        upper: vec3,  # [m]
         modulus: wp.array(dtype=real),  # [p] M [Pa]
-        rest: wp.array(dtype=vec3),
-        cell: wp.array(dtype=wp.vec3i),
-        offset: wp.array(dtype=vec3),
-        u: wp.array(dtype=vec3),
-        v: wp.array(dtype=vec3),
-        tau: wp.array(dtype=mat33),
+        rest: wp.array(dtype=vec3),  # [p] [m]
+        cell: wp.array(dtype=wp.vec3i),  # [p] of the rest position
+        offset: wp.array(dtype=vec3),  # [p] of the rest position in its cell [cells]
+        u: wp.array(dtype=vec3),  # [p] displacement [m]
+        v: wp.array(dtype=vec3),  # [p] [m/s]
+        tau: wp.array(dtype=mat33),  # [p] Kirchhoff stress [Pa]
         # out
         greatest: wp.array(dtype=real),  # [2] stiffness, speed squared
         counts: wp.array(dtype=int),  # [8] lowest cell, highest cell, infinite, outside

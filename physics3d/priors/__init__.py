@@ -1,0 +1,1 @@
+"""What a video should look like: denoisers, and score distillation from them."""

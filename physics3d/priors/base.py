@@ -9,12 +9,9 @@ and `x0_hat(z_t)` is the prior's estimate of z0. Networks differ in what they pu
 
     epsilon         n                                   x0 = (z_t - sigma out) / alpha
     v_prediction    (alpha n - sigma z0) / r            x0 = (alpha z_t / r - sigma out) / r
-    edm             F of Karras et al., sigma_data = 1  x0 = z_t / r^2 + sigma out / r      (alpha = 1)
-    flow_prediction n - z0, alpha + sigma = 1           x0 = z_t - sigma out
-    sample          z0                                  x0 = out
 
-v: Salimans and Ho (2022); edm: Karras et al. (2022), eq. 7; flow: Lipman et al. (2023). Stable Video Diffusion is
-v_prediction with alpha = 1, ModelScope is epsilon with alpha^2 + sigma^2 = 1.
+v: Salimans and Ho (2022). Stable Video Diffusion is v_prediction with alpha = 1, ModelScope is epsilon with
+alpha^2 + sigma^2 = 1.
 """
 
 import math
@@ -68,13 +65,7 @@ def x0_from(prediction: str, output: Tensor, z_t: Tensor, level: Level) -> Tenso
             return (z_t - sigma * output) / alpha
         case "v_prediction":
             return (alpha * z_t / r - sigma * output) / r
-        case "edm":
-            return z_t / r**2 + sigma * output / r
-        case "flow_prediction":
-            return z_t - sigma * output
-        case "sample":
-            return output
     raise ValueError(
-        f"prediction is {prediction!r}; known are epsilon, v_prediction, edm, flow_prediction, sample "
-        "(prediction_type of the scheduler)"
+        f"prediction is {prediction!r}; known are epsilon and v_prediction; take weights whose scheduler has one of "
+        "these as its prediction_type"
     )

@@ -17,29 +17,26 @@ the thing does. `blur: [0.0]` compares plain pixels.
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
+from annotated_types import MinLen
 from jaxtyping import Float
 from torch import Tensor
 
+from physics3d.checks import Ascending, NotNegative, Positive, require_fields
 from physics3d.priors.base import AbstractPrior, Level
 
 
 @dataclass(frozen=True, kw_only=True)
 class Exemplar(AbstractPrior):
-    blur: tuple[float, ...] = (1.0, 4.0)  # standard deviations of the low-pass [px of the video given]
-    sigma: tuple[float, float] = (
-        0.1,
-        10.0,
-    )  # noise levels, drawn uniformly in the logarithm (matters with several clips)
+    # standard deviations of the low-pass [px of the video given]
+    blur: Annotated[tuple[NotNegative, ...], MinLen(1)] = (1.0, 4.0)
+    # noise levels, drawn uniformly in the logarithm (matters with several clips)
+    sigma: Annotated[tuple[Positive, Positive], Ascending()] = (0.1, 10.0)
 
     def __post_init__(self):
-        if not self.blur or min(self.blur) < 0:
-            raise ValueError(
-                f"prior.blur is {self.blur}; give at least one standard deviation >= 0 px, e.g. [1.0, 4.0]"
-            )
-        if not 0 < self.sigma[0] <= self.sigma[1]:
-            raise ValueError(f"prior.sigma is {self.sigma}; give 0 < lowest <= highest")
+        require_fields(self, "prior")
 
     def condition(
         self, first: Float[Tensor, "h w 3"], clips: tuple[Float[Tensor, "t h w 3"], ...]

@@ -11,36 +11,40 @@ diffusers keeps its pipeline under `pipelines.deprecated`; weights and networks 
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from annotated_types import MultipleOf
 from jaxtyping import Float
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from physics3d.checks import Ascending, Device, Pixels, Share, Text, require_fields
 from physics3d.priors.base import AbstractPrior, Level, x0_from
-from physics3d.priors.weights import load_pipeline
+from physics3d.priors.weights import Precision, load_pipeline, pipeline_files
 
 
 @dataclass(frozen=True, kw_only=True)
 class ModelScope(AbstractPrior):
-    prompt: str  # what is seen and how it moves, e.g. "a carnation sways gently after being poked"
-    model: str = "ali-vilab/text-to-video-ms-1.7b"  # folder or hub repository
-    variant: str | None = "fp16"  # which weight files; None for the plain ones
-    precision: str = "float16"  # float32 on a CPU
-    device: str = "cuda"
-    height: int = 256  # what the network sees [px]
-    width: int = 256
+    prompt: Text  # what is seen and how it moves, e.g. "a carnation sways gently after being poked"
+    model: Text = "ali-vilab/text-to-video-ms-1.7b"  # folder or hub repository
+    variant: Text | None = "fp16"  # which weight files; None for the plain ones
+    precision: Precision = "float16"  # float32 on a CPU
+    device: Device = "cuda"
+    height: Annotated[Pixels, MultipleOf(8)] = 256  # what the network sees [px]
+    width: Annotated[Pixels, MultipleOf(8)] = 256
     guidance: float = 9.0
-    time: tuple[float, float] = (0.02, 0.98)  # range of the schedule that is drawn from, uniformly
+    # range of the schedule that is drawn from, uniformly
+    time: Annotated[tuple[Share, Share], Ascending()] = (0.02, 0.98)
 
     def __post_init__(self):
-        if not self.prompt.strip():
-            raise ValueError("prior.prompt is empty; say in a sentence what is seen and how it moves")
-        if self.height % 8 or self.width % 8:
-            raise ValueError(f"prior.height x prior.width is {self.height} x {self.width}; both must be multiples of 8")
-        if not 0 <= self.time[0] <= self.time[1] <= 1:
-            raise ValueError(f"prior.time is {self.time}; give 0 <= lowest <= highest <= 1")
+        require_fields(self, "prior")
+
+    def files(self) -> tuple[str, ...]:
+        """Of the weights, fetched if they are not on this machine: part of the fingerprint of what is learned."""
+        from diffusers.pipelines.deprecated.text_to_video_synthesis import TextToVideoSDPipeline
+
+        return pipeline_files(TextToVideoSDPipeline, self.model, key="prior.model", variant=self.variant)
 
     @cached_property
     def pipeline(self) -> Any:

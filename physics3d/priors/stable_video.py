@@ -14,15 +14,17 @@ call with a gradient through the encoder.
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import torch
+from annotated_types import Ge, Le, MultipleOf
 from jaxtyping import Float
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from physics3d.checks import Ascending, Device, NotNegative, Pixels, Positive, Rate, Text, require_fields
 from physics3d.priors.base import AbstractPrior, Level, x0_from
-from physics3d.priors.weights import load_pipeline
+from physics3d.priors.weights import Precision, load_pipeline, pipeline_files
 
 
 class ImageCondition(NamedTuple):
@@ -32,25 +34,28 @@ class ImageCondition(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class StableVideo(AbstractPrior):
-    model: str = (
-        "stabilityai/stable-video-diffusion-img2vid"  # folder or hub repository; trained on 14 frames (-xt: 25)
-    )
-    variant: str | None = "fp16"  # which weight files; None for the plain ones
-    precision: str = "float16"  # float32 on a CPU
-    device: str = "cuda"
-    height: int = 576  # what the network sees [px]
-    width: int = 1024
-    fps: float = 7.0  # [1/s], told to the network
-    motion_bucket: int = 127  # 0..255, how much motion to expect
-    noise_strength: float = 0.02  # noise on the conditioning image
+    # folder or hub repository; trained on 14 frames (-xt: 25)
+    model: Text = "stabilityai/stable-video-diffusion-img2vid"
+    variant: Text | None = "fp16"  # which weight files; None for the plain ones
+    precision: Precision = "float16"  # float32 on a CPU
+    device: Device = "cuda"
+    height: Annotated[Pixels, MultipleOf(8)] = 576  # what the network sees [px]
+    width: Annotated[Pixels, MultipleOf(8)] = 1024
+    fps: Annotated[Rate, Ge(1)] = 7.0  # [1/s], told to the network
+    motion_bucket: Annotated[int, Ge(0), Le(255)] = 127  # how much motion to expect
+    noise_strength: NotNegative = 0.02  # noise on the conditioning image
     guidance: tuple[float, float] = (1.0, 3.0)  # first and last frame
-    sigma: tuple[float, float] = (0.3, 30.0)  # noise levels, drawn uniformly in the logarithm
+    # noise levels, drawn uniformly in the logarithm
+    sigma: Annotated[tuple[Positive, Positive], Ascending()] = (0.3, 30.0)
 
     def __post_init__(self):
-        if self.height % 8 or self.width % 8:
-            raise ValueError(f"prior.height x prior.width is {self.height} x {self.width}; both must be multiples of 8")
-        if not 0 < self.sigma[0] <= self.sigma[1]:
-            raise ValueError(f"prior.sigma is {self.sigma}; give 0 < lowest <= highest")
+        require_fields(self, "prior")
+
+    def files(self) -> tuple[str, ...]:
+        """Of the weights, fetched if they are not on this machine: part of the fingerprint of what is learned."""
+        from diffusers import StableVideoDiffusionPipeline
+
+        return pipeline_files(StableVideoDiffusionPipeline, self.model, key="prior.model", variant=self.variant)
 
     @cached_property
     def pipeline(self) -> Any:

@@ -1,9 +1,11 @@
 """Where published weights come from: a local folder, else the hub's cache, else the hub, else one clear message."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
+
+Precision = Literal["float16", "bfloat16", "float32"]
 
 
 def load_pipeline(kind: Any, name: str, *, key: str, dtype: torch.dtype, variant: str | None) -> Any:
@@ -11,24 +13,35 @@ def load_pipeline(kind: Any, name: str, *, key: str, dtype: torch.dtype, variant
 
     Raises ValueError naming the configuration key and what was tried, after at most one short look at the network.
     """
+    folder = pipeline_folder(kind, name, key=key, variant=variant)
+    try:
+        return kind.from_pretrained(folder, local_files_only=True, dtype=dtype, variant=variant)
+    except (OSError, ValueError, AttributeError) as error:
+        raise ValueError(f"{key}={name}: no {kind.__name__} can be read from {folder}: {error}") from error
+
+
+def pipeline_files(kind: Any, name: str, *, key: str, variant: str | None) -> tuple[str, ...]:
+    """The files of such a pipeline, on this machine after the call. Raises ValueError as `load_pipeline`."""
+    folder = pipeline_folder(kind, name, key=key, variant=variant)
+    return tuple(sorted(str(p) for p in folder.rglob("*") if p.is_file()))
+
+
+def pipeline_folder(kind: Any, name: str, *, key: str, variant: str | None) -> Path:
+    """The folder itself, or the one in the hub's cache, fetched if it is not there."""
     folder = Path(name).expanduser()
-    options: dict[str, Any] = {"dtype": dtype, "variant": variant}
     if folder.is_dir():
-        try:
-            return kind.from_pretrained(folder, local_files_only=True, **options)
-        except (OSError, ValueError, AttributeError) as error:
-            raise ValueError(f"{key}={name} is a folder but no {kind.__name__} can be read from it: {error}") from error
+        return folder
     if folder.is_absolute() or name.startswith((".", "~")):
         raise ValueError(
             f"{key}={name} is not a folder; give the folder of a downloaded {kind.__name__} or its name on the hub"
         )
     try:
-        return kind.from_pretrained(name, local_files_only=True, **options)
+        return Path(kind.download(name, variant=variant, local_files_only=True))
     except (OSError, ValueError):
         pass  # not in the cache
     if hub_answers():
         try:
-            return kind.from_pretrained(name, **options)
+            return Path(kind.download(name, variant=variant))
         except (OSError, ValueError) as error:
             raise ValueError(f"{key}={name} could not be fetched from the hub: {error}") from error
     raise ValueError(

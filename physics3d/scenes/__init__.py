@@ -1,0 +1,1 @@
+"""Where a scene comes from: files of every kind, photographs without cameras, and synthetic twins."""

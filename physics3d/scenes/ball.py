@@ -10,11 +10,26 @@ import numpy as np
 
 from physics3d.boundaries.half_space import HalfSpace
 from physics3d.boundaries.impulse import Impulse
+from physics3d.checks import (
+    Count,
+    Device,
+    Duration,
+    Every,
+    Frames,
+    Length,
+    NotNegative,
+    Pixels,
+    PoissonsRatio,
+    Positive,
+    Rate,
+    Seed,
+    require_fields,
+)
 from physics3d.materials.viscoelastic import Viscoelastic
-from physics3d.scenes.base import AbstractSource, Capture
+from physics3d.scenes.base import AbstractSource, Capture, Footage, Outline
 from physics3d.scenes.photographs import held_out, triple
 from physics3d.scenes.studio import Light, Mesh, Studio, photographs, ring, surface_grid, to_linear
-from physics3d.scenes.synthetic import film, particles
+from physics3d.scenes.synthetic import film, particles, view_names
 from physics3d.world import World
 
 RADIUS = 0.05  # [m]
@@ -23,35 +38,41 @@ RADIUS = 0.05  # [m]
 @dataclass(frozen=True, kw_only=True)
 class BallTwin(AbstractSource):
     # what is photographed
-    views: int = 16
-    width: int = 96  # [px]
-    height: int = 96  # [px]
-    held_out_every: int = 8
-    points: int = 1000
+    views: Count = 16
+    width: Pixels = 96  # [px]
+    height: Pixels = 96  # [px]
+    held_out_every: Every = 8
+    points: Count = 1000
     # what moves, and how it is recorded
-    gap: float = 0.02  # between ball and floor at rest [m]
-    frames: int = 12  # of each take, the rest state included
-    fps: float = 48.0  # [1/s]
+    gap: NotNegative = 0.02  # between ball and floor at rest [m]
+    frames: Frames = 12  # of each take, the rest state included
+    fps: Rate = 48.0  # [1/s]
     evaluate_force: tuple[float, float, float] = (0.4, 0.0, 0.0)  # on the whole ball in the held-out take [N]
-    push: float = 0.05  # duration of the push [s]
+    push: Duration = 0.05  # duration of the push [s]
     # the truth
-    youngs_modulus: float = 6.0e3  # of the elastic branch [Pa]
-    poissons_ratio: float = 0.3
-    branch_shear_modulus: float = 1.2e3  # mu_N [Pa]
-    branch_bulk_modulus: float = 2.0e3  # K_N [Pa]
-    shear_viscosity_time: float = 0.05  # 1/k_d [s]
-    bulk_viscosity_time: float = 0.05  # 1/k_v [s]
-    density: float = 300.0  # [kg/m^3]
+    youngs_modulus: Positive = 6.0e3  # of the elastic branch [Pa]
+    poissons_ratio: PoissonsRatio = 0.3
+    branch_shear_modulus: Positive = 1.2e3  # mu_N [Pa]
+    branch_bulk_modulus: Positive = 2.0e3  # K_N [Pa]
+    shear_relaxation_time: Duration = 0.05  # 1/k_d [s]
+    bulk_relaxation_time: Duration = 0.05  # 1/k_v [s]
+    density: Positive = 300.0  # [kg/m^3]
     gravity: float = 9.81  # downward [m/s^2]
     # how the reference motion is computed: finer than the pipeline
-    dx: float = 0.0125  # cell of the grid [m]
-    seed: int = 0
-    device: str = "cpu"
+    dx: Length = 0.0125  # cell of the grid [m]
+    seed: Seed = 0
+    device: Device = "cpu"
 
     def files(self) -> tuple[str, ...]:
         return ()
 
+    @property
+    def outline(self) -> Outline:
+        takes = tuple(Footage(name=role, role=role, frames=self.frames, fps=self.fps) for role in ("learn", "evaluate"))
+        return Outline(name="ball", names=view_names(self.views), mattes=True, takes=takes)
+
     def __call__(self, *, log) -> Capture:
+        require_fields(self, "source")
         centre = (0.0, 0.0, RADIUS + self.gap)
         mesh = checkered_ball(centre)
         light = Light(sun=(1.0, 0.96, 0.9), backdrop=(1.0, 1.0, 1.0))
@@ -109,7 +130,7 @@ class BallTwin(AbstractSource):
             name="ball",
             images=tuple(images),
             cameras=tuple(cameras),
-            names=tuple(f"view_{i:03d}" for i in range(len(cameras))),
+            names=view_names(len(cameras)),
             held_out=held_out(len(images), self.held_out_every),
             alphas=tuple(alphas),
             background=light.backdrop,
@@ -117,6 +138,7 @@ class BallTwin(AbstractSource):
             point_colors=colors,
             takes=tuple(takes),
             single_object=True,
+            floor=0.0,
             truth=self.world().start,
             truth_source="set in the code that made this twin",
             note="this is a synthetic twin: ball, photographs and motion are made by code, so its material is known",

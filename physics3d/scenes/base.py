@@ -1,5 +1,6 @@
 """A capture: all that is known about a scene before anything is computed. Metres, z up, whatever the source used."""
 
+import math
 from dataclasses import dataclass, field
 
 import torch
@@ -9,6 +10,26 @@ from physics3d.artifact import AbstractArtifact, require_finite
 from physics3d.boundaries.base import AbstractBoundary
 from physics3d.gaussians.cameras import Camera
 from physics3d.gaussians.model import Gaussians
+
+
+@dataclass(frozen=True, kw_only=True)
+class Footage:
+    """How long a take is."""
+
+    name: str
+    role: str
+    frames: int
+    fps: float  # [1/s]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outline:
+    """What can be said of a capture before it is read; None: only reading it tells."""
+
+    name: str = "the capture"
+    names: tuple[str, ...] | None = None  # of the photographs
+    mattes: bool | None = None
+    takes: tuple[Footage, ...] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,6 +52,10 @@ class Take:
     release: int = 0  # first frame from which nothing but the World acts, where the excitation is unknown
     held_out_cameras: tuple[int, ...] = ()  # cameras used by evaluation only, although the take is learned from
 
+    @property
+    def footage(self) -> Footage:
+        return Footage(name=self.name, role=self.role, frames=len(self.videos[0]), fps=self.fps)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Capture(AbstractArtifact):
@@ -48,6 +73,7 @@ class Capture(AbstractArtifact):
     single_object: bool = False  # one object on a plain background: segmentation is then left out
     truth: dict[str, float] = field(default_factory=dict)  # material parameters, SI, named as in the material
     truth_source: str = ""  # where `truth` comes from, and how far to trust it
+    floor: float | None = None  # height of the ground that things stand on [m]; None: none is known
     note: str = ""  # said at the start of every run, e.g. that this is a synthetic twin
 
     def check(self) -> None:
@@ -71,6 +97,8 @@ class Capture(AbstractArtifact):
             raise ValueError(f"capture {self.name}: all {n} images are held out; leave some to train on")
         if self.points is not None:
             require_finite(f"capture {self.name}: points", self.points)
+        if self.floor is not None and not math.isfinite(self.floor):
+            raise ValueError(f"capture {self.name}: floor is {self.floor}; give its height in metres, or None")
         for take in self.takes:
             if take.role not in ("learn", "evaluate") or len(take.cameras) != len(take.videos):
                 raise ValueError(
@@ -78,6 +106,11 @@ class Capture(AbstractArtifact):
                 )
             if not all(0 <= take.release < len(video) for video in take.videos):
                 raise ValueError(f"take {take.name}: release is {take.release}, not one of its frames")
+
+    @property
+    def outline(self) -> Outline:
+        takes = tuple(take.footage for take in self.takes)
+        return Outline(name=self.name, names=self.names, mattes=bool(self.alphas), takes=takes)
 
     def take(self, role: str) -> Take | None:
         """The first take of that role, or None."""
@@ -94,6 +127,11 @@ class AbstractSource:
     def files(self) -> tuple[str, ...]:
         """Every file that the capture depends on; none for a scene made by code."""
         raise NotImplementedError
+
+    @property
+    def outline(self) -> Outline:
+        """What is known without reading anything: stages that cannot take it are refused before the work begins."""
+        return Outline()
 
     def __call__(self, *, log) -> Capture:
         raise NotImplementedError

@@ -15,47 +15,67 @@ import numpy as np
 
 from physics3d.boundaries.fixed_region import FixedRegion
 from physics3d.boundaries.impulse import Impulse
+from physics3d.checks import (
+    Count,
+    Device,
+    Duration,
+    Every,
+    Frames,
+    Length,
+    Pixels,
+    PoissonsRatio,
+    Positive,
+    Rate,
+    Seed,
+    require_fields,
+)
 from physics3d.gaussians.cameras import Camera
 from physics3d.materials.viscoelastic import Viscoelastic
-from physics3d.scenes.base import AbstractSource, Capture
+from physics3d.scenes.base import AbstractSource, Capture, Footage, Outline
 from physics3d.scenes.flower import SOIL, blossom_centre, plant, surroundings
 from physics3d.scenes.photographs import held_out, triple
 from physics3d.scenes.studio import Light, Studio, photographs, ring
-from physics3d.scenes.synthetic import film, particles
+from physics3d.scenes.synthetic import film, particles, view_names
 from physics3d.world import World
 
 
 @dataclass(frozen=True, kw_only=True)
 class CarnationTwin(AbstractSource):
     # what is photographed
-    views: int = 40
-    width: int = 320  # [px]
-    height: int = 240  # [px]
-    held_out_every: int = 8  # every so many photographs are kept for evaluation
-    points: int = 5000  # surface points, as from structure from motion
+    views: Count = 40
+    width: Pixels = 320  # [px]
+    height: Pixels = 240  # [px]
+    held_out_every: Every = 8  # every so many photographs are kept for evaluation
+    points: Count = 5000  # surface points, as from structure from motion
     # what moves, and how it is recorded
-    frames: int = 30  # of each take, the rest state included
-    fps: float = 30.0  # [1/s]
+    frames: Frames = 30  # of each take, the rest state included
+    fps: Rate = 30.0  # [1/s]
     learn_force: tuple[float, float, float] = (0.09, 0.02, 0.0)  # on the blossom in the take to learn from [N]
     evaluate_force: tuple[float, float, float] = (-0.05, 0.06, 0.02)  # in the take that is held out [N]
-    push: float = 0.1  # duration of the push, from the first frame [s]
+    push: Duration = 0.1  # duration of the push, from the first frame [s]
     # the truth
-    youngs_modulus: float = 1.5e5  # of the elastic branch [Pa]
-    poissons_ratio: float = 0.3
-    branch_shear_modulus: float = 3.0e4  # mu_N [Pa]
-    branch_bulk_modulus: float = 6.5e4  # K_N, of the same Poisson ratio [Pa]
-    shear_viscosity_time: float = 0.15  # 1/k_d [s]
-    bulk_viscosity_time: float = 0.15  # 1/k_v [s]
-    density: float = 300.0  # petals hold much air [kg/m^3]
+    youngs_modulus: Positive = 1.5e5  # of the elastic branch [Pa]
+    poissons_ratio: PoissonsRatio = 0.3
+    branch_shear_modulus: Positive = 3.0e4  # mu_N [Pa]
+    branch_bulk_modulus: Positive = 6.5e4  # K_N, of the same Poisson ratio [Pa]
+    shear_relaxation_time: Duration = 0.15  # 1/k_d [s]
+    bulk_relaxation_time: Duration = 0.15  # 1/k_v [s]
+    density: Positive = 300.0  # petals hold much air [kg/m^3]
     # how the reference motion is computed: finer than the pipeline
-    dx: float = 0.010  # cell of the grid [m]
-    seed: int = 0
-    device: str = "cpu"
+    dx: Length = 0.010  # cell of the grid [m]
+    seed: Seed = 0
+    device: Device = "cpu"
 
     def files(self) -> tuple[str, ...]:
         return ()
 
+    @property
+    def outline(self) -> Outline:
+        takes = tuple(Footage(name=role, role=role, frames=self.frames, fps=self.fps) for role in ("learn", "evaluate"))
+        return Outline(name="carnation", names=view_names(self.views), mattes=False, takes=takes)
+
     def __call__(self, *, log) -> Capture:
+        require_fields(self, "source")
         meshes, solids = plant(self.seed)
         light = Light(backdrop=(0.80, 0.83, 0.86))
         studio = Studio([*meshes, *surroundings(self.seed)], light, openness_rays=24, seed=self.seed)
@@ -101,12 +121,13 @@ class CarnationTwin(AbstractSource):
             name="carnation",
             images=tuple(images),
             cameras=tuple(cameras),
-            names=tuple(f"view_{i:03d}" for i in range(len(cameras))),
+            names=view_names(len(cameras)),
             held_out=held_out(len(images), self.held_out_every),
             background=light.backdrop,
             points=points,
             point_colors=colors,
             takes=tuple(takes),
+            floor=0.0,
             truth=self.world().start,
             truth_source="set in the code that made this twin",
             note=(

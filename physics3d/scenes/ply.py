@@ -7,46 +7,46 @@ images. Turning the model to z up turns its spherical harmonics too: coefficient
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
+from annotated_types import Ge, Gt, Le, Lt
 from jaxtyping import Float64
 from torch import Tensor
 
+from physics3d.checks import Colour, Count, Direction, Pixels, Positive, Text, require_fields
 from physics3d.gaussians.model import Gaussians
 from physics3d.gaussians.ply import read_ply
 from physics3d.gaussians.render import render
 from physics3d.gaussians.sh import sh_basis
+from physics3d.pictures import to_uint8
 from physics3d.scenes.axes import Axes
 from physics3d.scenes.base import AbstractSource, Capture
 from physics3d.scenes.photographs import triple
 from physics3d.scenes.studio import ring
-from physics3d.video import to_uint8
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlyScene(AbstractSource):
-    name: str
-    path: str  # the .ply file
-    up: tuple[float, float, float]  # up in the file's coordinates; models trained on COLMAP often have (0, -1, 0)
-    scale: float  # metres per unit of the file [m]
-    views: int = 24
-    elevation: float = 20.0  # of the ring of cameras [deg]
-    opening: float = 45.0  # of their lenses, across [deg]
-    width: int = 320  # [px]
-    height: int = 240  # [px]
-    background: tuple[float, float, float] = (1.0, 1.0, 1.0)  # 0..1
+    name: Text
+    path: Text  # the .ply file
+    up: Direction  # up in the file's coordinates; models trained on COLMAP often have (0, -1, 0)
+    scale: Positive  # metres per unit of the file [m]
+    views: Count = 24
+    elevation: Annotated[float, Ge(-90), Le(90)] = 20.0  # of the ring of cameras [deg]
+    opening: Annotated[float, Gt(0), Lt(180)] = 45.0  # of their lenses, across [deg]
+    width: Pixels = 320  # [px]
+    height: Pixels = 240  # [px]
+    background: Colour = (1.0, 1.0, 1.0)  # 0..1
     single_object: bool = False  # one object and nothing else: nothing to segment
 
     def files(self) -> tuple[str, ...]:
         return (self.path,)
 
     def __call__(self, *, log) -> Capture:
-        if self.views < 1 or not 0 < self.opening < 180:
-            raise ValueError(
-                f"views is {self.views}, opening {self.opening}; take at least 1 view and 0 to 180 degrees"
-            )
-        gaussians = oriented(read_ply(Path(self.path)), Axes(up=triple("up", self.up), scale=self.scale))
+        require_fields(self, "source")
+        gaussians = oriented(read_ply(Path(self.path), log=log), Axes(up=triple("up", self.up), scale=self.scale))
         solid = gaussians.mean[gaussians.opacity >= gaussians.opacity.median()].double()
         centre = solid.median(0).values
         radius = float((solid - centre).norm(dim=1).quantile(0.9))

@@ -1,33 +1,39 @@
-"""Structure from motion: photographs without cameras -> pinhole cameras, undistorted photographs and points, by COLMAP.
+"""Structure from motion: photographs without cameras -> cameras, lens and points, by COLMAP.
 
     match SIFT features over all pairs (of a video: over neighbours), place one photograph after the other, adjust all
 
-COLMAP fixes neither the unit of length, nor where up is, nor the origin; `upright` chooses them:
+COLMAP begins with two photographs whose directions to the same points differ by `FIRST_ANGLES`: many where the
+photographer walked around, few where all look the same way, so that smaller angles are tried before giving up.
+It fixes neither the unit of length, nor where up is, nor the origin; `upright` chooses them (`ground.py`):
 
-    up      = the unit u of least  mean_i (u.x_i)^2 + 0.005 |u - (u.y) y|^2,  x_i the cameras' right, y their mean up:
-              people hold the horizon level; if a plane of points lies within 15 degrees of that, the plane's normal
-    origin  = the point nearest to all optical axes, dropped onto that plane (the floor, z = 0) where there is one
+    up      = the normal of the floor where there is one, else how the cameras were held
+    origin  = the point nearest to all optical axes, dropped onto the floor (z = 0) where there is one
     scale   = camera distance / median distance of the cameras from that point                        [m per unit]
 
 Schönberger and Frahm (2016); pycolmap is an optional extra.
 """
 
+import contextlib
+import signal
+import sqlite3
+import threading
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64
 
-from physics3d.open3d_import import open3d
 from physics3d.scenes.axes import Axes
+from physics3d.scenes.ground import FLAT, aim, floor_plane, level
+from physics3d.scenes.parallax import share_explained
 
 LEAST_PLACED = 0.5  # share of the photographs that must get a camera
 MOST_EXHAUSTIVE = 120  # photographs: above that, only neighbours in the order of their names are compared
-FEATURES = 4096  # of a photograph, at most
-TILT = 15.0  # largest angle between the cameras' level and the floor's normal [deg]
-TOWARDS_MEAN_UP = 0.005  # weight of the cameras' mean up, for cameras that do not turn around the object
-FLOOR = 0.08  # least share of the points that makes a plane a floor
-FLAT = 0.01  # thickness of a floor, over the distance of the cameras
+NEIGHBOURS = 10  # photographs after each that are compared in a video, and those 2, 4, 8, ... after, up to 2^10
+FEATURES = 4096  # of a photograph, at most: the largest
+PAIRS_AT_ONCE = 24  # compared between two looks at the progress
+FIRST_ANGLES = (16.0, 8.0, 4.0, 2.0)  # tried for the first two photographs [deg]
+STANDING = 0.4  # share of the matches that a camera in one place explains above which it did not move
+PAIRS_ASKED = 40  # pairs of photographs of which that is asked
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,13 +44,15 @@ class Solved:
     placed: tuple[str, ...]  # names of the photographs that have a camera
     lost: tuple[str, ...]  # ... and of those that have none
     error: float  # mean reprojection error [px]
+    span: float  # largest angle between two cameras, seen from what they look at [deg]
     floor: bool  # whether a plane of points was taken as the floor
 
 
 def solve(images: Path, folder: Path, *, ordered: bool, camera_distance: float, seed: int, log) -> Solved:
     """Cameras of the photographs in `images`, all by one lens if they are of one size; written below `folder`.
 
-    Raises ValueError, with what to do, if pycolmap is missing or fewer than half of the photographs can be placed.
+    Raises ValueError, with what to do, if pycolmap is missing, the camera did not move, or fewer than half of the
+    photographs can be placed.
     """
     pycolmap = _pycolmap()
     names = sorted(p.name for p in images.iterdir())
@@ -52,108 +60,164 @@ def solve(images: Path, folder: Path, *, ordered: bool, camera_distance: float, 
         raise ValueError(f"structure from motion needs at least 3 photographs, there are {len(names)}; take about 30")
     pycolmap.set_random_seed(seed)
     database = folder / "database.db"
-    extraction = pycolmap.FeatureExtractionOptions()
-    extraction.sift.max_num_features = FEATURES
-    mode = pycolmap.CameraMode.SINGLE if _one_size(images, names) else pycolmap.CameraMode.PER_IMAGE
-    reader = pycolmap.ImageReaderOptions()
-    for some in log.progress([names[i : i + 4] for i in range(0, len(names), 4)], "finding features, by four"):
-        pycolmap.extract_features(
-            database, images, some, camera_mode=mode, reader_options=reader, extraction_options=extraction
+    _extract(pycolmap, database, images, names, log)
+    _match(pycolmap, database, folder / "pairs.txt", names, ordered=ordered, log=log)
+    still = share_explained(_matches(pycolmap, database), _longest_side(pycolmap, database))
+    if still is not None:
+        log.metric("matches_without_parallax", still)
+    if still is not None and still > STANDING:
+        raise ValueError(
+            f"the camera must move: one that stands still, turns or zooms explains {100 * still:.0f} % of what the "
+            f"{len(names)} pictures have in common, so they say nothing of depth; walk around the thing"
         )
-        if mode == pycolmap.CameraMode.SINGLE:
-            reader.existing_camera_id = 1  # the lens of the first
-    log.info(f"matching the features of {len(names)} photographs")
-    if ordered or len(names) > MOST_EXHAUSTIVE:
-        pycolmap.match_sequential(database)
-    else:
-        pycolmap.match_exhaustive(database)
-    options = pycolmap.IncrementalPipelineOptions()
-    options.min_model_size, options.random_seed = 3, seed
-    placing = log.progress(None, "placing photographs", total=len(names))
-    models = pycolmap.incremental_mapping(
-        database, images, _made(folder / "models"), options, next_image_callback=lambda: placing.update() and None
-    )
-    placing.close()
-    model = max(models.values(), key=lambda m: m.num_reg_images(), default=None)
+    model, angle = _placed(pycolmap, database, images, folder / "models", names, seed, log)
     placed = sorted(i.name for i in model.images.values() if i.has_pose) if model else []
     lost = tuple(n for n in names if n not in set(placed))
-    if model is None or len(placed) < max(3, LEAST_PLACED * len(names)):
+    if model is None or not _enough(len(placed), len(names)):
         raise ValueError(
             f"only {len(placed)} of {len(names)} photographs could be placed (not: {', '.join(lost[:6])}"
             f"{', ...' if len(lost) > 6 else ''}); take sharp ones, each overlapping the one before by two thirds, "
             "with texture around the object (a newspaper under it helps), or give cameras: scene.source ColmapSource"
         )
-    floor = upright(model, camera_distance, seed)
-    model.write(_made(folder / "upright"))
-    pycolmap.undistort_images(folder / "pinhole", folder / "upright", images, jpeg_quality=97)
-    _made(folder / "pinhole" / "sparse" / "0")
-    for file in (folder / "pinhole" / "sparse").glob("*.bin"):
-        file.rename(file.parent / "0" / file.name)
+    if angle < FIRST_ANGLES[0]:
+        log.warn(f"no two photographs of the same points differ by {FIRST_ANGLES[0]:g} degrees; began with {angle:g}")
+    floor, span = upright(model, camera_distance, seed)
+    model.write(_made(folder / "sparse" / "0"))
     error = float(model.compute_mean_reprojection_error())
-    return Solved(folder=folder / "pinhole", placed=tuple(placed), lost=lost, error=error, floor=floor)
+    return Solved(folder=folder, placed=tuple(placed), lost=lost, error=error, span=span, floor=floor)
 
 
-def upright(model, camera_distance: float, seed: int) -> bool:
-    """Turn, scale and shift a pycolmap.Reconstruction as told above, in place. Whether there is a floor."""
+def upright(model, camera_distance: float, seed: int) -> tuple[bool, float]:
+    """Turn, scale and shift a pycolmap.Reconstruction as told above, in place.
+
+    Whether there is a floor, and the angle that the cameras span [deg]. Raises ValueError where they look apart.
+    """
     pycolmap = _pycolmap()
     poses = np.stack([i.cam_from_world().matrix() for i in model.images.values() if i.has_pose])
     points = np.stack([p.xyz for p in model.points3D.values()])
     R, t = poses[:, :, :3], poses[:, :, 3]
-    centres = -np.einsum("nji,nj->ni", R, t)
-    middle = nearest_to_axes(centres, R[:, 2])
-    reach = float(np.median(np.linalg.norm(centres - middle, axis=1)))
-    up, origin = level(R), middle
-    plane = floor_plane(points, up, middle, FLAT * reach, seed)
+    seen = aim(R, t, points)
+    if seen is None:
+        raise ValueError("the cameras look at no common place; photograph one thing from several sides")
+    up, origin = level(R), seen.middle
+    plane = floor_plane(points, up, seen.middle, FLAT * seen.distance, seed)
     if plane is not None:
         up = plane[:3]
-        origin = middle - (middle @ up + plane[3]) * up
-    scale = camera_distance / reach
+        origin = seen.middle - (seen.middle @ up + plane[3]) * up
+    scale = camera_distance / seen.distance
     Q = Axes(up=(float(up[0]), float(up[1]), float(up[2])), scale=1.0).rotation().numpy()
     model.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(Q), -scale * Q @ origin))
-    return plane is not None
+    return plane is not None, seen.span
 
 
-def level(R: Float64[np.ndarray, "n 3 3"]) -> Float64[np.ndarray, "3"]:
-    """Unit up of cameras with world-to-camera rotations R (OpenCV axes), held level by a person."""
-    right, up = R[:, 0], -R[:, 1].mean(0)
-    up = up / np.linalg.norm(up)
-    cost = np.einsum("ni,nj->ij", right, right) / len(R) + TOWARDS_MEAN_UP * (np.eye(3) - np.outer(up, up))
-    best = np.linalg.eigh(cost)[1][:, 0]
-    return best * (1 if best @ up >= 0 else -1)
+def pairs(names: list[str], *, ordered: bool) -> list[tuple[str, str]]:
+    """Which photographs are compared: all, or in a video (and of very many) each with those that follow."""
+    n = len(names)
+    if ordered or n > MOST_EXHAUSTIVE:
+        steps = sorted({*range(1, NEIGHBOURS + 1), *(2**k for k in range(NEIGHBOURS + 1))})
+    else:
+        steps = list(range(1, n))
+    return [(names[i], names[i + step]) for step in steps for i in range(n - step)]
 
 
-def nearest_to_axes(centres: Float64[np.ndarray, "n 3"], axes: Float64[np.ndarray, "n 3"]) -> np.ndarray:
-    """The point nearest to all lines through `centres` along the unit vectors `axes`, by least squares."""
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    return np.linalg.lstsq(across.sum(0), np.einsum("nij,nj->i", across, centres), rcond=None)[0]
+def _extract(pycolmap, database: Path, images: Path, names: list[str], log) -> None:
+    """Features of all photographs, the largest `FEATURES` of each: COLMAP keeps whole octaves, up to twice as many."""
+    options = pycolmap.FeatureExtractionOptions()
+    options.sift.max_num_features = FEATURES
+    mode = pycolmap.CameraMode.SINGLE if _one_size(images, names) else pycolmap.CameraMode.PER_IMAGE
+    reader = pycolmap.ImageReaderOptions()
+    for some in log.progress([names[i : i + 4] for i in range(0, len(names), 4)], "finding features, by four"):
+        pycolmap.extract_features(
+            database, images, some, camera_mode=mode, reader_options=reader, extraction_options=options
+        )
+        if mode == pycolmap.CameraMode.SINGLE:
+            reader.existing_camera_id = 1  # the lens of the first
+    with contextlib.closing(sqlite3.connect(database)) as db, db:
+        rows = db.execute("SELECT image_id, rows, cols, data FROM keypoints WHERE rows > ?", (FEATURES,)).fetchall()
+        for image, count, columns, data in rows:
+            keypoints = np.frombuffer(data, np.float32).reshape(count, columns)
+            (described,) = db.execute("SELECT data FROM descriptors WHERE image_id = ?", (image,)).fetchone()
+            descriptors = np.frombuffer(described, np.uint8).reshape(count, -1)
+            area = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])  # x, y, 2 x 2 shape
+            kept = np.sort(np.argsort(-area, kind="stable")[:FEATURES])
+            for table, array in (("keypoints", keypoints), ("descriptors", descriptors)):
+                db.execute(
+                    f"UPDATE {table} SET rows = ?, data = ? WHERE image_id = ?",
+                    (len(kept), array[kept].tobytes(), image),
+                )
 
 
-def floor_plane(
-    points: Float64[np.ndarray, "n 3"], up: np.ndarray, middle: np.ndarray, thickness: float, seed: int
-) -> np.ndarray | None:
-    """(n, d) of the plane n.x + d = 0 with unit n near `up`, below `middle`, of the most points; None if there is none.
+def _match(pycolmap, database: Path, list_file: Path, names: list[str], *, ordered: bool, log) -> None:
+    wanted = pairs(names, ordered=ordered)
+    options = pycolmap.ImportedPairingOptions()
+    options.match_list_path = list_file
+    bar = log.progress(None, "comparing pairs of photographs", total=len(wanted))
+    for i in range(0, len(wanted), PAIRS_AT_ONCE):
+        some = wanted[i : i + PAIRS_AT_ONCE]
+        list_file.write_text("".join(f"{a} {b}\n" for a, b in some))
+        pycolmap.match_image_pairs(database, pairing_options=options)
+        bar.update(len(some))
+    bar.close()
 
-    Walls and table tops are found first where they have more points, and set aside.
-    """
-    o3d = open3d()
-    o3d.utility.random.seed(seed)
-    left, total = points, len(points)
-    for _ in range(5):
-        if len(left) < max(20, FLOOR * total):
-            return None
-        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(left))
-        plane, inside = cloud.segment_plane(thickness, 3, 1000)
-        if len(inside) < FLOOR * total:
-            return None
-        plane = np.asarray(plane) / np.linalg.norm(plane[:3])
-        plane = plane * (1 if plane[:3] @ up >= 0 else -1)
-        if plane[:3] @ up > np.cos(np.radians(TILT)) and plane[:3] @ middle + plane[3] > -2 * thickness:
-            return plane
-        left = np.delete(left, inside, 0)
-    return None
+
+def _matches(pycolmap, database: Path):
+    """Verified matches of pairs of photographs, spread over all pairs, from the middle of the pictures [px]."""
+    opened = pycolmap.Database.open(database)
+    try:
+        cameras = {c.camera_id: np.array([c.width, c.height]) / 2 for c in opened.read_all_cameras()}
+        middle = {i.image_id: cameras[i.camera_id] for i in opened.read_all_images()}
+        with contextlib.closing(sqlite3.connect(database)) as db:
+            found = [
+                i for (i,) in db.execute("SELECT pair_id FROM two_view_geometries WHERE rows > 0 ORDER BY pair_id")
+            ]
+        for k in np.unique(np.linspace(0, len(found) - 1, min(len(found), PAIRS_ASKED)).round().astype(int)):
+            a, b = pycolmap.pair_id_to_image_pair(found[k])
+            index = np.asarray(opened.read_two_view_geometry(a, b).inlier_matches)
+            yield tuple(opened.read_keypoints(i)[index[:, c], :2] - middle[i] for c, i in enumerate((a, b)))
+    finally:
+        opened.close()
+
+
+def _longest_side(pycolmap, database: Path) -> float:
+    opened = pycolmap.Database.open(database)
+    try:
+        return float(max(max(c.width, c.height) for c in opened.read_all_cameras()))
+    finally:
+        opened.close()
+
+
+def _placed(pycolmap, database: Path, images: Path, folder: Path, names: list[str], seed: int, log):
+    """The largest pycolmap.Reconstruction (None: nothing) and the first angle that gave it [deg]."""
+    best, its_angle = None, FIRST_ANGLES[0]
+    for angle in FIRST_ANGLES:
+        options = pycolmap.IncrementalPipelineOptions()
+        options.min_model_size, options.random_seed, options.mapper.init_min_tri_angle = 3, seed, angle
+        bar = log.progress(None, f"placing photographs, from {angle:g} degrees", total=len(names))
+        models = pycolmap.incremental_mapping(
+            database,
+            images,
+            _made(folder / f"{angle:g}"),
+            options,
+            next_image_callback=lambda bar=bar: bar.update() and None,
+        )
+        bar.close()
+        model = max(models.values(), key=lambda m: m.num_reg_images(), default=None)
+        if model is not None and (best is None or model.num_reg_images() > best.num_reg_images()):
+            best, its_angle = model, angle
+        if best is not None and _enough(best.num_reg_images(), len(names)):
+            break
+    return best, its_angle
+
+
+def _enough(placed: int, of: int) -> bool:
+    return placed >= max(3, LEAST_PLACED * of)
 
 
 def _pycolmap():
+    # before pycolmap, whose own compression library Pillow would otherwise be bound to: writing a PNG then crashes
+    from PIL import Image  # noqa: F401
+
+    handler = signal.getsignal(signal.SIGTERM)
     try:
         import pycolmap
     except ImportError as error:
@@ -161,6 +225,8 @@ def _pycolmap():
             "photographs without cameras need pycolmap, which is not installed; .venv/bin/python -m pip install "
             "pycolmap (it is the extra 'sfm'), or solve the cameras elsewhere and take ColmapSource"
         ) from error
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, handler)  # COLMAP's would end the process with a stack of C++
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
     return pycolmap
 

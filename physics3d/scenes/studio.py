@@ -10,7 +10,7 @@ where `open` is the share of the sky over a vertex, baked once with a few rays o
 same from every side, and `visible` is one shadow ray towards a sun of about a degree.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -208,7 +208,7 @@ def ring(
     *,
     distance: float,
     elevation: float,
-    azimuths: Float[np.ndarray, " n"],
+    azimuths: Float[np.ndarray, " n"] | Sequence[float],
     width: int,
     height: int,
     opening: float,
@@ -245,7 +245,7 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> Float32[np.ndarra
 
 
 def surface_grid(
-    position: Float[np.ndarray, "a b 3"], albedo: Float[np.ndarray, "a b 3"], *, closed_b: bool = False, **kwargs
+    position: Float[np.ndarray, "a b 3"], albedo: Float[np.ndarray, "*ab 3"], *, closed_b: bool = False, **kwargs
 ) -> Mesh:
     """Mesh of a parametrised surface; `closed_b` joins the last column to the first."""
     rows, columns = position.shape[:2]

@@ -23,6 +23,11 @@ from physics3d.scenes.studio import Mesh, Studio
 from physics3d.world import World
 
 
+def view_names(count: int) -> tuple[str, ...]:
+    """Of the photographs of a twin."""
+    return tuple(f"view_{i:03d}" for i in range(count))
+
+
 def film(
     *,
     role: str,

@@ -1,81 +1,78 @@
-"""transforms.json: NeRF-synthetic (Blender; one opening angle, often RGBA) and the OPENCV_PINHOLE kind of nerfstudio.
+"""transforms.json: NeRF-synthetic (Blender; one opening angle, often RGBA), nerfstudio and instant-ngp.
 
-    {"camera_angle_x": rad, "frames": [{"file_path": "./train/r_0", "transform_matrix": 4x4}]}
-    {"fl_x": px, "fl_y": px, "cx": px, "cy": px, "w": px, "h": px, "frames": [...]}     (each may also stand in a frame)
+    {"camera_angle_x": rad, "camera_angle_y": rad, "frames": [{"file_path": "./train/r_0", "transform_matrix": 4x4}]}
+    {"fl_x": px, "fl_y": px, "cx": px, "cy": px, "w": px, "h": px, "k1": ..., "p1": ..., "frames": [...]}
 
-transform_matrix is camera-to-world with OpenGL camera axes (x right, y up, z backward). A path without an ending means
-.png. Points of structure from motion are taken from points3D.npz (xyz, rgb) beside the file where it exists.
-Mildenhall et al. 2020; docs.nerf.studio, "data conventions".
+What describes the lens may also stand in a frame and holds there. transform_matrix is camera-to-world with OpenGL
+camera axes (x right, y up, z backward). Pictures are undistorted as they are read: k1, k2, p1, p2 are OpenCV's, k3 and
+k4 the factors of r^6 and r^8 (Brown's, as nerfstudio computes them); with "camera_model": "FULL_OPENCV", or with k5 or
+k6, k4, k5 and k6 are OpenCV's denominator. A picture's `mask_path` is black where it shows nothing of the object and is
+taken as its matte. Points of structure from motion are taken from `ply_file_path`, or from points3D.npz (xyz, rgb)
+beside the file. Mildenhall et al. 2020; docs.nerf.studio, "data conventions".
 """
 
 import json
 import math
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float64
+from torch import Tensor
 
-from physics3d.gaussians.cameras import Camera
-from physics3d.scenes.axes import OPENGL_TO_OPENCV, Axes, rigid_inverse
-from physics3d.scenes.base import AbstractSource, Capture
-from physics3d.scenes.photographs import held_out, mattes, read_photograph, triple
+from physics3d.scenes.axes import OPENGL_TO_OPENCV, rigid_inverse
+from physics3d.scenes.lens import Lens
+from physics3d.scenes.named import find, present, read_text, require_unique
+from physics3d.scenes.posed import AbstractPosedSource, Points, Posed
 
-DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+MODELS = (
+    "PINHOLE",
+    "SIMPLE_PINHOLE",
+    "OPENCV_PINHOLE",
+    "PERSPECTIVE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "OPENCV",
+    "FULL_OPENCV",
+)
+OTHER_CAMERAS = ("is_fisheye", "latlong", "equirectangular", "orthographic", "ftheta_p0")  # instant-ngp's switches
+COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
 @dataclass(frozen=True, kw_only=True)
-class TransformsSource(AbstractSource):
-    name: str
-    path: str  # the .json file, or the folder that holds transforms.json
-    up: tuple[float, float, float]  # up in the file's coordinates; NeRF-synthetic has (0, 0, 1)
-    scale: float  # metres per unit of the file [m]
-    held_out_every: int = 8  # every so many images are kept for evaluation; 0: none
-    resolution: float | None = None  # factor on both image sides, in (0, 1]
-    background: tuple[float, float, float] = (1.0, 1.0, 1.0)  # put behind images with alpha, 0..1
-    single_object: bool = False  # one object on a plain background: nothing to segment
+class TransformsSource(AbstractPosedSource):
+    """`path` is the .json file, or the folder that holds transforms.json; NeRF-synthetic has up = (0, 0, 1)."""
 
     def files(self) -> tuple[str, ...]:
-        file, content = self._read()
-        images = [str(_image_path(file, frame)) for frame in content["frames"]]
-        points = file.parent / "points3D.npz"
-        return (str(file), *sorted(images), *([str(points)] if points.is_file() else []))
+        file, content = self._content()
+        frames = _frames(file, content)
+        masks = [str(mask) for _, frame in frames if (mask := _mask(file, content, frame)) is not None]
+        points = _points_file(file, content)
+        images = [str(path) for path, _ in frames]
+        return (str(file), *sorted(images), *sorted(set(masks)), *([str(points)] if points is not None else []))
 
-    def __call__(self, *, log) -> Capture:
-        file, content = self._read()
-        axes = Axes(up=triple("up", self.up), scale=self.scale)
-        axes.check()
-        frames = sorted(content["frames"], key=lambda frame: str(_image_path(file, frame)))
-        images, alphas, cameras, names = [], [], [], []
-        for frame in log.progress(frames, "reading images"):
-            path = _image_path(file, frame)
-            name = str(path.relative_to(file.parent)) if path.is_relative_to(file.parent) else str(path)
-            image, alpha, size = read_photograph(
-                path, background=triple("background", self.background), resolution=self.resolution
+    def read(self, log) -> tuple[list[Posed], Points | None]:
+        file, content = self._content()
+        posed = []
+        for path, frame in _frames(file, content, log):
+            entry = {**content, **frame}
+            _refuse_other_cameras(entry, path)
+            posed.append(
+                Posed(
+                    path=path,
+                    name=str(path.relative_to(file.parent)) if path.is_relative_to(file.parent) else str(path),
+                    lens=partial(_lens, file, content, frame, path),
+                    size=_size(entry, path),
+                    world_to_camera=_pose(file, entry, path),
+                    mask=_mask(file, content, frame),
+                )
             )
-            camera = _camera(file, {**content, **frame}, path, size, axes)
-            images.append(image)
-            alphas.append(alpha)
-            cameras.append(camera.scaled(self.resolution) if self.resolution else camera)
-            names.append(name)
-        axes.report(cameras, log)
-        points, colors = _points(file.parent / "points3D.npz", axes)
-        capture = Capture(
-            name=self.name,
-            images=tuple(images),
-            cameras=tuple(cameras),
-            names=tuple(names),
-            held_out=held_out(len(images), self.held_out_every),
-            alphas=mattes(names, alphas),
-            background=triple("background", self.background),
-            points=points,
-            point_colors=colors,
-            single_object=self.single_object,
-        )
-        capture.check()
-        return capture
+        points = _points_file(file, content)
+        return posed, None if points is None else _points(points)
 
-    def _read(self) -> tuple[Path, dict]:
+    def _content(self) -> tuple[Path, dict]:
         file = Path(self.path)
         if file.is_dir():
             file = file / "transforms.json"
@@ -84,69 +81,141 @@ class TransformsSource(AbstractSource):
                 f"no camera file at {file}; check the path in the scene's configuration (DATA=... on the command line)"
             )
         try:
-            content = json.loads(file.read_text())
-            frames = content["frames"]
-            _ = [frame["file_path"] + "" for frame in frames]
+            content = json.loads(read_text(file))
+            _ = [frame["file_path"] + "" for frame in content["frames"]]
         except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
             raise ValueError(
                 f"{file} is not a transforms.json with a list of frames and their file_path: {error!r}"
             ) from error
-        if not frames:
+        if not content["frames"]:
             raise ValueError(f"{file} lists no images; its frames are empty")
         return file, content
 
 
-def _image_path(file: Path, frame: dict) -> Path:
-    path = file.parent / frame["file_path"]
-    return path if path.suffix else path.with_name(path.name + ".png")
+def _frames(file: Path, content: dict, log=None) -> list[tuple[Path, dict]]:
+    """The frames whose picture exists, by name."""
+    frames = [(find(file.parent, frame["file_path"]), frame) for frame in content["frames"]]
+    require_unique([str(path) for path, _ in frames], file)
+    there = present((path for path, _ in frames), file.parent, file, log)
+    return sorted(((path, frame) for path, frame in frames if path in there), key=lambda pair: str(pair[0]))
 
 
-def _camera(file: Path, entry: dict, path: Path, size: tuple[int, int], axes: Axes) -> Camera:
-    """One camera for an image of `size` (width, height). Raises ValueError naming the image."""
-    width, height = size
-    if (entry.get("w", width), entry.get("h", height)) != (width, height):
+def _mask(file: Path, content: dict, frame: dict) -> Path | None:
+    name = frame.get("mask_path") or content.get("mask_path")
+    return find(file.parent, name) if name else None
+
+
+def _refuse_other_cameras(entry: dict, path: Path) -> None:
+    model = entry.get("camera_model") or "PINHOLE"
+    switches = [name for name in OTHER_CAMERAS if entry.get(name)]
+    if str(model).upper() not in MODELS or switches:
+        said = f"camera_model {model}" if str(model).upper() not in MODELS else f"{switches[0]}: {entry[switches[0]]}"
         raise ValueError(
-            f"{path} has {width} x {height} pixels, {file.name} says {entry.get('w')} x {entry.get('h')}; "
-            "camera file and images disagree, resize one of them"
+            f"{path}: {said} is no perspective camera; known are {', '.join(MODELS)}: convert the pictures"
         )
-    bent = {k: entry[k] for k in DISTORTION if entry.get(k)}
-    if bent:
-        raise ValueError(
-            f"{path}: the camera has lens distortion {bent}; undistort the images first (colmap image_undistorter)"
-        )
+
+
+def _size(entry: dict, path: Path) -> tuple[int, int] | None:
+    if "w" not in entry and "h" not in entry:
+        return None
     try:
-        fx = float(entry["fl_x"]) if "fl_x" in entry else width / 2 / math.tan(0.5 * float(entry["camera_angle_x"]))
-        fy = float(entry.get("fl_y", fx))
-        pose = torch.tensor(entry["transform_matrix"], dtype=torch.float64)
-        if pose.shape != (4, 4):
-            raise ValueError(f"transform_matrix has shape {tuple(pose.shape)}")
+        width, height = int(entry["w"]), int(entry["h"])
+        if width < 1 or height < 1:
+            raise ValueError("must be positive")
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: w and h are {entry.get('w')}, {entry.get('h')}; give both, in pixels") from error
+    return width, height
+
+
+def _lens(file: Path, content: dict, frame: dict, path: Path, width: int, height: int) -> Lens:
+    """The lens of one frame for a picture of this size. Raises ValueError naming the picture."""
+    entry = {**content, **frame}
+    try:
+        fx = _focal(frame, "x", width) or _focal(content, "x", width)
+        fy = _focal(frame, "y", height) or _focal(content, "y", height)
+        if fx is None and fy is None:
+            raise KeyError("fl_x")
+        k = {name: float(entry.get(name) or 0.0) for name in COEFFICIENTS}
+        cx, cy = float(entry.get("cx", width / 2)), float(entry.get("cy", height / 2))
     except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
         raise ValueError(
-            f"{file}: entry of {path.name} needs fl_x or camera_angle_x and a 4x4 transform_matrix: {error!r}"
+            f"{file}: entry of {path.name} needs fl_x or camera_angle_x, and numbers for the lens: {error!r}"
         ) from error
-    camera = Camera(
+    rational = str(entry.get("camera_model")).upper() == "FULL_OPENCV" or k["k5"] != 0 or k["k6"] != 0
+    return Lens(
         width=width,
         height=height,
-        fx=fx,
-        fy=fy,
-        cx=float(entry.get("cx", width / 2)),
-        cy=float(entry.get("cy", height / 2)),
-        world_to_camera=axes.world_to_camera(rigid_inverse(pose @ OPENGL_TO_OPENCV, str(path))),
+        fx=fx if fx is not None else fy or 0.0,
+        fy=fy if fy is not None else fx or 0.0,
+        cx=cx,
+        cy=cy,
+        radial=(k["k1"], k["k2"], k["k3"], *(() if rational else (k["k4"],))),
+        denominator=(k["k4"], k["k5"], k["k6"]) if rational else (),
+        tangential=(k["p1"], k["p2"]),
     )
-    camera.check(str(path))
-    return camera
 
 
-def _points(file: Path, axes: Axes) -> tuple[torch.Tensor | None, torch.Tensor | None]:
-    if not file.is_file():
-        return None, None
+def _focal(entry: dict, axis: str, pixels: int) -> float | None:
+    """Focal length along x or y [px], from fl_x or camera_angle_x; None where neither is given."""
+    if f"fl_{axis}" in entry:
+        return float(entry[f"fl_{axis}"])
+    if f"camera_angle_{axis}" in entry:
+        return pixels / 2 / math.tan(0.5 * float(entry[f"camera_angle_{axis}"]))
+    return None
+
+
+def _pose(file: Path, entry: dict, path: Path) -> Float64[Tensor, "4 4"]:
+    """World-to-camera with OpenCV axes. Raises ValueError naming the picture."""
     try:
-        with np.load(file, allow_pickle=False) as arrays:
-            xyz, rgb = arrays["xyz"].astype(np.float32), arrays["rgb"].astype(np.float32) / 255
+        pose = torch.tensor(entry["transform_matrix"], dtype=torch.float64)
+        if pose.shape == (3, 4):
+            pose = torch.cat([pose, torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=torch.float64)])
+        if pose.shape != (4, 4):
+            raise ValueError(f"transform_matrix has shape {tuple(pose.shape)}")
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{file}: entry of {path.name} needs a 4x4 transform_matrix: {error!r}") from error
+    if torch.isfinite(pose).all() and (pose[3] - torch.tensor([0.0, 0.0, 0.0, 1.0])).abs().max() > 1e-6:
+        raise ValueError(
+            f"{path}: the last row of transform_matrix is {pose[3].tolist()}, not 0 0 0 1; transpose it if it is "
+            "written by columns"
+        )
+    return rigid_inverse(pose @ OPENGL_TO_OPENCV, str(path))
+
+
+def _points_file(file: Path, content: dict) -> Path | None:
+    name = content.get("ply_file_path")
+    if name:
+        return find(file.parent, name)
+    beside = file.parent / "points3D.npz"
+    return beside if beside.is_file() else None
+
+
+def _points(file: Path) -> Points:
+    """Points with their colours. Raises ValueError naming the file."""
+    if not file.is_file():
+        raise ValueError(f"there is no file of points {file}; restore it, or drop ply_file_path")
+    try:
+        if file.suffix.lower() == ".ply":
+            xyz, rgb = _from_ply(file)
+        else:
+            with np.load(file, allow_pickle=False) as arrays:
+                xyz, rgb = arrays["xyz"].astype(np.float64), arrays["rgb"].astype(np.float32) / 255
     except Exception as error:
         raise ValueError(
             f"cannot read the points {file}: {error}; it must hold xyz [n, 3] and rgb [n, 3] in 0..255"
         ) from error
     if not np.isfinite(xyz).all():
         raise ValueError(f"{file}: {int((~np.isfinite(xyz)).sum())} coordinates are NaN or infinite; drop those points")
-    return axes.points(torch.from_numpy(xyz)), torch.from_numpy(rgb)
+    return Points(xyz=xyz, rgb=rgb)
+
+
+def _from_ply(file: Path) -> tuple[np.ndarray, np.ndarray]:
+    """xyz and colours in 0..1; grey where the file has no colours."""
+    from plyfile import PlyData
+
+    vertex = PlyData.read(str(file))["vertex"].data
+    xyz = np.stack([vertex[name].astype(np.float64) for name in ("x", "y", "z")], -1)
+    if "red" not in vertex.dtype.names:
+        return xyz, np.full(xyz.shape, 0.5, np.float32)
+    rgb = np.stack([vertex[name] for name in ("red", "green", "blue")], -1)
+    return xyz, (rgb / (255 if rgb.dtype.kind in "ui" else 1)).astype(np.float32)

@@ -1,52 +1,61 @@
 """Your own photographs of a thing, or a video around it, without cameras: structure from motion finds them.
 
 Metres, z up. What no photograph can tell is guessed, said, and can be corrected: the size of things (`camera_distance`)
-and which way is up (`up`, in the axes of the first run).
+and which way is up (`up`, in the axes of the first run). `Capture.floor` is 0 where a floor was found, None where not.
 """
 
+import re
 import tempfile
+from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Ge, Le
 
+from physics3d.checks import Colour, Direction, Every, Length, Pixels, Seed, Text, require_fields
 from physics3d.scenes.base import AbstractSource, Capture
 from physics3d.scenes.colmap import ColmapSource
+from physics3d.scenes.frames import VIDEOS, sharpest_frames
+from physics3d.scenes.photographs import triple
+from physics3d.scenes.pictures import PHOTOGRAPHS, TURN, UNREAD, photographs_in, read_picture
 from physics3d.scenes.sfm import Solved, solve
 
-PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
-VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
+NARROW = 30.0  # angle around the thing below which it is warned [deg]
 
 
 @dataclass(frozen=True, kw_only=True)
 class UnposedSource(AbstractSource):
-    name: str
-    path: str  # folder of photographs, or a video file
-    camera_distance: float  # of the cameras from what they look at, in the middle [m]; this sets the size of everything
-    frames: int = 60  # taken from a video: the sharpest of each of so many stretches; a folder is used whole
-    longest_side: int = 1200  # photographs are reduced to this [px]
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # correction: what is up, in the axes that were guessed
-    held_out_every: int = 8  # every so many images are kept for evaluation; 0: none
-    background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    name: Text
+    path: Text  # folder of photographs, or a video file
+    camera_distance: Length  # of the cameras from what they look at, in the middle [m]; sets the size of everything
+    # taken from a video: the sharpest of each of so many stretches; a folder is used whole
+    frames: Annotated[int, Ge(3), Le(100_000)] = 60
+    longest_side: Annotated[Pixels, Ge(64)] = 1200  # photographs are reduced to this [px]
+    up: Direction = (0.0, 0.0, 1.0)  # correction: what is up, in the axes that were guessed
+    held_out_every: Every = 8  # every so many images are kept for evaluation; 0: none
+    background: Colour = (1.0, 1.0, 1.0)  # put behind photographs with alpha, 0..1
     single_object: bool = False  # one object on a plain background: nothing to segment
-    seed: int = 0
+    seed: Seed = 0
 
     def files(self) -> tuple[str, ...]:
         path = Path(self.path)
-        return (str(path),) if path.suffix.lower() in VIDEOS else tuple(str(p) for p in _photographs(path))
+        return (str(path),) if _is_video(path) else tuple(str(p) for p in photographs_below(path))
 
     def __call__(self, *, log) -> Capture:
         """Raises ValueError for settings out of range, no or too few photographs, or when they cannot be placed."""
         self.check()
         path = Path(self.path)
-        video = path.suffix.lower() in VIDEOS
+        video = _is_video(path)
         with tempfile.TemporaryDirectory(prefix="physics3d_") as work:
             images = Path(work) / "images"
             images.mkdir()
+            called: dict[str, str] = {}  # copy -> the user's name of it
             if video:
-                _frames(path, images, self.frames, self.longest_side, log)
+                sharpest_frames(path, images, self.frames, self.longest_side, log)
             else:
-                _copies(_photographs(path), images, self.longest_side, log)
+                called = _copies(path, images, self.longest_side, triple("background", self.background), log)
             solved = solve(
                 images, Path(work), ordered=video, camera_distance=self.camera_distance, seed=self.seed, log=log
             )
@@ -60,26 +69,30 @@ class UnposedSource(AbstractSource):
                 background=self.background,
                 single_object=self.single_object,
             )(log=log)
-        said = f"scale and up are guesses: cameras {self.camera_distance:g} m away"
-        return replace(capture, note=f"{len(solved.placed)} photographs placed by structure from motion; {said}")
+        turned = tuple(self.up) != (0.0, 0.0, 1.0)
+        floor = 0.0 if solved.floor and not turned else None
+        said = f"{len(solved.placed)} photographs placed by structure from motion; scale and up are guesses: cameras "
+        said += f"{self.camera_distance:g} m away; " + ("the floor is z = 0" if floor == 0 else "no floor is known")
+        names = tuple(called.get(name, name) for name in capture.names)
+        return replace(capture, names=names, note=said, floor=floor)
 
     def check(self) -> None:
-        if not 0 < self.camera_distance < float("inf"):
-            raise ValueError(
-                f"camera_distance is {self.camera_distance}; give the distance the photographs were taken from [m]"
-            )
-        if self.frames < 3:
-            raise ValueError(f"frames is {self.frames}; take at least 3 of the video, better 60")
-        if self.longest_side < 64:
-            raise ValueError(f"longest_side is {self.longest_side} px; it must be at least 64, better 1200")
+        """Raise ValueError naming field, value and remedy."""
+        require_fields(self, "source")
 
     def _report(self, solved: Solved, log) -> None:
         total = len(solved.placed) + len(solved.lost)
         log.info(f"{len(solved.placed)} of {total} photographs placed, reprojection error {solved.error:.2f} px")
         log.metric("photographs_placed", len(solved.placed))
         log.metric("reprojection_error_px", solved.error)
+        log.metric("camera_span_deg", solved.span)
         if solved.lost:
             log.warn(f"not placed, left out: {', '.join(solved.lost[:12])}{', ...' if len(solved.lost) > 12 else ''}")
+        if solved.span < NARROW:
+            log.warn(
+                f"the cameras span only {solved.span:.0f} degrees around what they look at: depth is uncertain, and "
+                "what is behind was never seen; walk further around it"
+            )
         log.info(
             "assumed: up is the normal of the largest level plane, which is the floor at z = 0"
             if solved.floor
@@ -91,56 +104,95 @@ class UnposedSource(AbstractSource):
         )
 
 
-def _photographs(folder: Path) -> list[Path]:
+def photographs_below(folder: Path, log=None) -> list[Path]:
+    """The photographs of a folder; where it holds none itself, of its subfolders. What is not read is said.
+
+    Raises ValueError if there are none.
+    """
     if not folder.is_dir():
         raise ValueError(
             f"no folder of photographs and no video ({', '.join(VIDEOS)}) at {folder}; "
             "give it: make run SCENE=photos DATA=<folder or video>"
         )
-    found = sorted(p for p in folder.iterdir() if p.suffix.lower() in PHOTOGRAPHS)
+    below = [d for d in sorted(folder.rglob("*")) if d.is_dir() and not _hidden(d.relative_to(folder))]
+    found = photographs_in(folder)
+    deeper = [p for d in below for p in photographs_in(d)]
+    if found and deeper and log is not None:
+        log.warn(f"{len(deeper)} photographs in subfolders of {folder} are left out; give the subfolder, or move them")
+    found = found or deeper
+    taken = set(found) | set(deeper)
+    files = [p for p in sorted(folder.rglob("*")) if p.is_file() and not _hidden(p.relative_to(folder))]
+    others = Counter(p.suffix.lower() or "no ending" for p in files if p not in taken)
+    unread = {ending: count for ending, count in others.items() if ending in UNREAD}
     if not found:
-        raise ValueError(f"{folder} holds no photographs ({', '.join(PHOTOGRAPHS)}); convert HEIC to JPEG first")
+        there = ", ".join(f"{count} {ending}" for ending, count in sorted(others.items())) or "nothing"
+        remedy = "convert HEIC and raw photographs to JPEG first" if unread else "give a folder of JPEG or PNG files"
+        if any(ending in VIDEOS for ending in others):
+            remedy = "of a video, give the file itself"
+        raise ValueError(f"{folder} holds no photographs ({', '.join(PHOTOGRAPHS)}), but {there}; {remedy}")
+    if unread and log is not None:
+        counts = ", ".join(f"{count} {ending}" for ending, count in unread.items())
+        log.warn(f"{counts} beside the {len(found)} photographs cannot be read and are left out; convert them to JPEG")
     return found
 
 
-def _copies(photographs: list[Path], target: Path, longest_side: int, log) -> None:
-    """Turned upright as their EXIF says, reduced, as JPEG that keeps the EXIF focal length."""
-    from PIL import Image, ImageOps
-
-    for path in log.progress(photographs, "reading photographs"):
-        try:
-            with Image.open(path) as file:
-                picture = ImageOps.exif_transpose(file).convert("RGB")
-        except Exception as error:  # PIL raises OSError, SyntaxError, zlib.error, DecompressionBombError ...
-            raise ValueError(f"cannot read the image {path}: {error}; the file is broken, replace it") from error
-        picture.thumbnail((longest_side, longest_side), Image.Resampling.LANCZOS)
-        copy = target / f"{path.stem}.jpg"
-        if copy.exists():
-            raise ValueError(f"two photographs of {path.parent} are called {path.stem}; rename one")
-        picture.save(copy, quality=97, exif=picture.getexif())
+def _hidden(path: Path) -> bool:
+    """Files and folders that systems leave: ._IMG.jpg, __MACOSX, @eaDir."""
+    return any(part.startswith((".", "__MACOSX", "@")) for part in path.parts)
 
 
-def _frames(video: Path, target: Path, count: int, longest_side: int, log) -> None:
-    """The sharpest frame (variance of the Laplacian) of each of `count` equal stretches."""
-    import cv2
+def _is_video(path: Path) -> bool:
+    return path.suffix.lower() in VIDEOS if not path.exists() else path.is_file()
 
-    if not video.is_file():
-        raise ValueError(f"no video at {video}; give it: make run SCENE=photos DATA=<folder or video>")
-    reader = cv2.VideoCapture(str(video))
-    total = int(reader.get(cv2.CAP_PROP_FRAME_COUNT))
-    best: dict[int, float] = {}
-    for i in log.progress(range(total), "choosing frames"):
-        good, frame = reader.read()
-        if not good:
-            break
-        factor = longest_side / max(frame.shape[:2])
-        if factor < 1:
-            frame = cv2.resize(frame, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
-        stretch = i * min(count, total) // total
-        sharp = float(np.var(cv2.Laplacian(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), cv2.CV_32F)))
-        if sharp > best.get(stretch, -1.0):
-            best[stretch] = sharp
-            cv2.imwrite(str(target / f"frame_{stretch:04d}.jpg"), frame, [cv2.IMWRITE_JPEG_QUALITY, 97])
-    reader.release()
-    if not best:
-        raise ValueError(f"cannot read a frame of {video}; convert it to MP4 (H.264), or extract photographs")
+
+def _copies(
+    folder: Path, target: Path, longest_side: int, background: tuple[float, float, float], log
+) -> dict[str, str]:
+    """Turned as their EXIF says, reduced, as JPEG that keeps the EXIF focal length; with alpha as PNG.
+
+    Under alpha 0 a copy has the background's colour: structure from motion does not look at alpha, and what an editor
+    left there stands for nothing. Returns the names of the copies, which hold no blanks, and of what they are copies.
+    """
+    from PIL import Image
+
+    called: dict[str, str] = {}
+    with_matte, without = [], []
+    for path in log.progress(photographs_below(folder, log), "reading photographs"):
+        picture = read_picture(path).shown()
+        matte = picture.alpha
+        if matte is None:
+            without.append(path.name)
+        elif matte.min() < 1:
+            with_matte.append(path.name)
+        name = re.sub(r"\s", "_", "__".join(path.relative_to(folder).with_suffix("").parts))
+        name += ".jpg" if matte is None else ".png"
+        if name in called:
+            raise ValueError(f"two photographs are called nearly the same: {called[name]} and {path.name}; rename one")
+        called[name] = path.relative_to(folder).as_posix()
+        layers = picture.color if matte is None else np.concatenate([picture.color, 255 * matte[..., None]], -1)
+        copy = Image.fromarray((layers + 0.5).astype(np.uint8))
+        copy.thumbnail((longest_side, longest_side), Image.Resampling.LANCZOS)
+        if matte is not None:
+            array = np.array(copy)
+            array[array[..., 3] == 0, :3] = np.round(255 * np.asarray(background)).astype(np.uint8)
+            copy = Image.fromarray(array)
+        copy.save(target / name, quality=97, exif=_without_turn(path))
+    if with_matte and without:
+        raise ValueError(
+            f"{without[0]} has no alpha channel, but {with_matte[0]} has one that hides something; give all "
+            "photographs a matte or none"
+        )
+    return called
+
+
+def _without_turn(path: Path):
+    """The EXIF of a photograph, which holds its focal length, without the turn that its copy no longer needs."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as file:
+            exif = file.getexif()
+    except Exception:  # no format of Pillow's: read by OpenCV
+        return Image.Exif()
+    exif.pop(TURN, None)
+    return exif

@@ -42,3 +42,14 @@ def thinned(points, most: int):
     if len(points) <= most:
         return points
     return points[np.linspace(0, len(points) - 1, most).round().astype(int)]
+
+
+def share_of(part: Bool[np.ndarray, "h w"], whole: Bool[np.ndarray, "h w"]) -> float:
+    """Share of the part that lies on the whole; 1 for nothing."""
+    return float((part & whole).sum() / part.sum()) if part.any() else 1.0
+
+
+def intersection_over_union(a: Bool[np.ndarray, "h w"], b: Bool[np.ndarray, "h w"]) -> float:
+    """Intersection over union; 1 for two empty masks."""
+    union = (a | b).sum()
+    return float((a & b).sum() / union) if union else 1.0

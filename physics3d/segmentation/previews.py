@@ -1,7 +1,5 @@
 """Pictures for the person who checks a segmentation."""
 
-from collections.abc import Sequence
-
 import numpy as np
 from jaxtyping import Int, UInt8
 
@@ -15,15 +13,3 @@ def tinted(image: UInt8[np.ndarray, "h w 3"], labels: Int[np.ndarray, "h w"]) ->
         chosen = labels == k
         out[chosen] = (0.65 * image[chosen] + 0.35 * COLOURS[(k - 1) % len(COLOURS)]).astype(np.uint8)
     return out
-
-
-def contact_sheet(images: Sequence[UInt8[np.ndarray, "h w 3"]], columns: int = 4) -> UInt8[np.ndarray, "H W 3"]:
-    """Pictures in rows, each in the corner of a white cell as large as the largest."""
-    height, width = (max(i.shape[k] for i in images) + 4 for k in (0, 1))
-    columns = min(columns, len(images))
-    rows = -(-len(images) // columns)
-    sheet = np.full((rows * height, columns * width, 3), 255, np.uint8)
-    for k, image in enumerate(images):
-        v, u = k // columns * height, k % columns * width
-        sheet[v : v + image.shape[0], u : u + image.shape[1]] = image
-    return sheet

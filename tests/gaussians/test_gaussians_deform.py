@@ -7,7 +7,9 @@ import pytest
 import torch
 
 from physics3d.gaussians.cameras import Camera, look_at
-from physics3d.gaussians.deform import Backdrop, Embedding, _Rotation, carry, embed, render_deformed
+from physics3d.gaussians.carry import _Rotation, carry
+from physics3d.gaussians.deform import Backdrop, render_deformed
+from physics3d.gaussians.embedding import Embedding, embed
 from physics3d.gaussians.model import Gaussians
 from physics3d.gaussians.render import render
 
@@ -118,7 +120,8 @@ def test_particles_beyond_a_gap_or_of_another_part_carry_nothing(reason):
 
 def test_a_part_without_particles_rides_on_what_there_is():
     X = lattice(0.25)
-    tied = embed(X[:2] + 0.01, torch.arange(2), X, 0.25, parts=(torch.tensor([7, 0]), torch.zeros(len(X))))
+    parts = torch.tensor([7, 0]), torch.zeros(len(X), dtype=torch.int64)
+    tied = embed(X[:2] + 0.01, torch.arange(2), X, 0.25, parts=parts)
     assert tied.weights.sum(1).tolist() == pytest.approx([1, 1])
     assert tied.neighbours[0, 0] == 0
 
@@ -183,7 +186,7 @@ def test_gaussians_far_from_every_particle_still_follow():
     assert torch.isfinite(tied.weights).all() and tied.weights.sum() == pytest.approx(1)
 
 
-def test_bad_arguments_are_refused_with_a_remedy():
+def test_bad_arguments_are_refused_with_a_remedy(unchecked):
     X, which = lattice(0.5), torch.arange(2)
     with pytest.raises(ValueError, match="no particles"):
         embed(X[:2], which, X[:0], 0.5)

@@ -8,18 +8,15 @@ import pytest
 import torch
 
 from physics3d.gaussians.cameras import Camera, look_at
-from physics3d.gaussians.densify import Adaptive, Relocation, shared
-from physics3d.gaussians.fit import (
-    Exposure,
-    Photograph,
-    background_points,
-    drawn_error,
-    from_points,
-    psnr,
-    random_points,
-)
+from physics3d.gaussians.densification.adaptive import Adaptive
+from physics3d.gaussians.densification.relocation import Relocation, shared
+from physics3d.gaussians.exposure import Exposure
+from physics3d.gaussians.fit import drawn_error
 from physics3d.gaussians.floaters import floaters
+from physics3d.gaussians.loss import psnr
+from physics3d.gaussians.photograph import Photograph
 from physics3d.gaussians.render import render
+from physics3d.gaussians.start import background_points, from_points, random_points
 
 
 def ring(radius=0.3, count=8) -> list[Photograph]:

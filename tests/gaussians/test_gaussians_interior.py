@@ -7,7 +7,8 @@ import pytest
 import torch
 from analytic_bodies import cameras_around, discs, sphere
 
-from physics3d.gaussians.deform import embed, render_deformed
+from physics3d.gaussians.deform import render_deformed
+from physics3d.gaussians.embedding import embed
 from physics3d.gaussians.interior import Interior, paint
 from physics3d.gaussians.model import Gaussians
 from physics3d.gaussians.render import render

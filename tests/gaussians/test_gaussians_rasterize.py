@@ -18,7 +18,7 @@ from physics3d.gaussians.cameras import Camera, look_at
 from physics3d.gaussians.model import Gaussians
 from physics3d.gaussians.rasterize import contribution, rasterize
 from physics3d.gaussians.render import render
-from physics3d.gaussians.splatting import Numerics
+from physics3d.gaussians.splat import Numerics
 from physics3d.gaussians.twin import rasterize_plainly
 from physics3d.gaussians.with_gsplat import rasterize_with_gsplat
 
@@ -352,7 +352,7 @@ def test_non_finite_input_is_refused_by_name(index, bad):
         rasterize(*arrays, camera(), background=BACKGROUND)
 
 
-def test_a_wrong_shape_is_refused_by_name():
+def test_a_wrong_shape_is_refused_by_name(unchecked):
     mean, covariance, opacity, color = cloud(5)
     with pytest.raises(ValueError, match="opacity has shape"):
         rasterize(mean, covariance, opacity[:, None], color, camera(), background=BACKGROUND)

@@ -6,14 +6,16 @@ import pytest
 import torch
 from mpm_bodies import every_material
 
-from physics3d.materials import driver
 from physics3d.materials.base import AbstractMaterial
+from physics3d.materials.material_points import advance
 from physics3d.materials.mixture import Mixture
+from physics3d.materials.mooney_rivlin import MooneyRivlin
 from physics3d.materials.neo_hookean import NeoHookean
 from physics3d.materials.newtonian import Newtonian
 from physics3d.materials.viscoelastic import Viscoelastic
 from physics3d.materials.von_mises import VonMises
 from physics3d.materials.with_branches import WithBranches
+from physics3d.materials.yeoh import Yeoh
 
 ONE = torch.eye(3, dtype=torch.float64)
 
@@ -23,6 +25,7 @@ def found_materials() -> list[AbstractMaterial]:
     return [
         *every_material(),
         Viscoelastic(spring="neo_hookean"),
+        Viscoelastic(spring="neo_hookean", flow="stress"),
         Viscoelastic(branches=0),
         Viscoelastic(elastic=False),
         Viscoelastic(branches=3),
@@ -72,7 +75,7 @@ def walk(material, H, increments, dt=0.01):
     c = coefficients(material, len(H), H.dtype)
     memory, history = material.initial_memory(len(H), H.dtype), []
     for M in increments:
-        H, tau, memory = driver.advance(material, dt, M / dt, H, c, memory)
+        H, tau, memory = advance(material, dt, M / dt, H, c, memory)
         history.append(tau)
     return torch.stack(history), H, memory
 
@@ -117,6 +120,23 @@ def test_stress_rotates_with_the_body_and_forgets_the_rotation_before(material, 
     torch.testing.assert_close(tau, tau.mT, rtol=0, atol=round_off)
 
 
+@pytest.mark.parametrize("size", [1e-6, 0.1])
+def test_a_finite_rotation_in_every_step_changes_nothing(material, size, rng):
+    """Each step turns the body, or whoever looks at it, by another rotation of any angle."""
+    increments = size * random(rng, 4, 6, 3, 3)
+    Q = torch.stack([ONE.repeat(6, 1, 1), *(random_rotation(rng, 6) for _ in increments)])
+    turned = torch.stack([Q[i + 1] @ (ONE + M) @ Q[i].mT - ONE for i, M in enumerate(increments)])
+    start = torch.zeros(6, 3, 3, dtype=torch.float64)
+    tau, H, memory = walk(material, start, increments)
+    seen, H_seen, memory_seen = walk(material, start, turned)
+    # 1 + 1e-6 holds ten digits of the small strain; F and its rotation are rounded against the stiffness
+    round_off = 1e-13 * stiffness(material) + 1e-12 * tau.abs().max()
+    torch.testing.assert_close(seen, Q[1:] @ tau @ Q[1:].mT, rtol=0, atol=round_off)
+    c = coefficients(material, 6)
+    expected = material.energy(c, H, memory)
+    torch.testing.assert_close(material.energy(c, H_seen, memory_seen), expected, rtol=1e-8, atol=round_off)
+
+
 @pytest.mark.parametrize("size", [1e-6, 0.3])
 def test_stress_is_the_derivative_of_the_stored_energy(material, size, rng):
     """Where nothing flows: for sand and metal, that is under slight compression and far inside the yield surface."""
@@ -126,17 +146,53 @@ def test_stress_is_the_derivative_of_the_stored_energy(material, size, rng):
     M = size * random(rng, n, 3, 3) - (1e-4 * ONE if size < 0.1 else 0)
     _, H, memory = walk(material, torch.zeros_like(M), [M])
     c = coefficients(material, n)
-    _, tau, _ = driver.advance(material, 0.0, torch.zeros_like(M), H, c, memory)
+    _, tau, _ = advance(material, 0.0, torch.zeros_like(M), H, c, memory)
     A, step, instant = random(rng, n, 3, 3), min(1e-5, size), 1e-15
 
     def energy(sign):
-        H_next, _, memory_next = driver.advance(material, instant, sign * step / instant * A, H, c, memory)
+        H_next, _, memory_next = advance(material, instant, sign * step / instant * A, H, c, memory)
         return material.energy(c, H_next, memory_next)
 
     power = (energy(1) - energy(-1)) / (2 * step)
     # central differences: step^2, and round-off 1e-16 of the stiffness over the step, which is 1e-6 of the small stress
     accuracy = 1e-7 if size > 0.1 else 1e-5
     torch.testing.assert_close((tau * A).sum((1, 2)), power, rtol=1e-5, atol=accuracy * tau.abs().max().item())
+
+
+def small_strain_moduli(material) -> tuple[float, float]:
+    """(mu, lam) [Pa] of the solid at once after it is strained, by the handbook."""
+    example, mu, lam = material.example, 0.0, 0.0
+    if "poissons_ratio" in example:
+        E, nu = example["youngs_modulus"], example["poissons_ratio"]
+        mu, lam = E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu))
+    if isinstance(material, MooneyRivlin):
+        mu = 2 * (example["first_modulus"] + example["second_modulus"])
+        lam = example["bulk_modulus"] - 2 / 3 * mu
+    if isinstance(material, Yeoh):
+        mu = 2 * example["linear_modulus"]
+        lam = example["bulk_modulus"] - 2 / 3 * mu
+    for suffix in ("", "_2", "_3"):
+        if "branch_shear_modulus" + suffix in example:
+            mu_N, K_N = (example[f"branch_{name}_modulus{suffix}"] for name in ("shear", "bulk"))
+            mu, lam = mu + mu_N, lam + K_N - 2 / 3 * mu_N
+    return mu, lam
+
+
+def test_small_strains_have_the_moduli_of_the_handbook(material, rng):
+    """Hooke's law; sand and snow under enough pressure to hold, and the fluid by its volume alone."""
+    if isinstance(material, Mixture):
+        pytest.skip("its parts are tested")
+    mu, lam = small_strain_moduli(material)
+    strain = 1e-7 * random(rng, 6, 3, 3)
+    strain = strain + strain.mT
+    strain = strain - (strain.diagonal(dim1=1, dim2=2).mean(1) + 2e-6)[:, None, None] * ONE
+    (tau,), _, _ = walk(material, torch.zeros_like(strain), [strain], dt=1e-12)
+    trace = strain.diagonal(dim1=1, dim2=2).sum(1)[:, None, None]
+    expected = 2 * mu * strain + lam * trace * ONE
+    if isinstance(material, Newtonian):
+        tau, expected = tau.diagonal(dim1=1, dim2=2).sum(1), 3 * material.example["bulk_modulus"] * trace[:, 0, 0]
+    # the next order of strain, which bulk moduli of thirty shear moduli make 1e-4 of the shear
+    torch.testing.assert_close(tau, expected, rtol=1e-4, atol=1e-5 * float(expected.abs().max()))
 
 
 def test_no_energy_from_nothing(material, rng):
@@ -146,14 +202,14 @@ def test_no_energy_from_nothing(material, rng):
     A, B = 0.006 * random(rng, 2, n, 3, 3)
     c, H = coefficients(material, n), torch.zeros(n, 3, 3, dtype=torch.float64)
     memory, work, scale = material.initial_memory(n, torch.float64), torch.zeros(n), torch.zeros(n)
-    _, before, _ = driver.advance(material, 0.0, H, H, c, memory)
+    _, before, _ = advance(material, 0.0, H, H, c, memory)
     for angle in phase:
         M = A * angle.sin() + B * (0.7 * angle).sin()  # starts gently: no large first step
-        H, tau, memory = driver.advance(material, dt, M / dt, H, c, memory)
+        H, tau, memory = advance(material, dt, M / dt, H, c, memory)
         log_increment = M - M @ M / 2 + M @ M @ M / 3
         done = (0.5 * (tau + before) * log_increment).sum((1, 2))
         work, scale, before = work + done, scale + done.abs(), tau
-        # 1 %: trapezoidal rule with 400 steps, and the stored strain of a Maxwell branch is half a step ahead
+        # 1 %: trapezoidal rule with 400 steps
         assert (work - material.energy(c, H, memory) >= -0.01 * scale).all()
 
 
@@ -166,7 +222,8 @@ def test_adjoint_is_the_derivative(material, rng):
     weights = [random(rng, n, 3, 3), random(rng, n, 3, 3) / unit, random(rng, *memory.shape)]
 
     def functional(inputs):
-        H_next, tau, memory_next = driver.advance(material, 0.05, *inputs)
+        # no relaxation time of the samples: longer steps store the strain in another form
+        H_next, tau, memory_next = advance(material, 0.04, *inputs)
         terms = (weights[0] * H_next).sum((1, 2)), (weights[1] * tau).sum((1, 2)), (weights[2] * memory_next).sum(0)
         return sum(terms)
 
@@ -209,8 +266,8 @@ def test_extreme_deformation_stays_finite(material, dtype, rng):
         leaves = [M / dt, torch.zeros_like(M), coefficients(material, len(M), dtype)]
         leaves = [x.clone().requires_grad_() for x in leaves]
         memory = material.initial_memory(len(M), dtype)
-        results = driver.advance(material, dt, *leaves, memory)
-        again = driver.advance(material, dt, 0.01 * leaves[0], results[0], leaves[2], results[2])
+        results = advance(material, dt, *leaves, memory)
+        again = advance(material, dt, 0.01 * leaves[0], results[0], leaves[2], results[2])
         unit = stiffness(material)
         loss = sum(x.sum() for x in (results[0], again[0], results[1] / unit, again[1] / unit, results[2], again[2]))
         for x in (*results, *again, *torch.autograd.grad(loss, leaves)):
@@ -226,10 +283,10 @@ def test_float32_follows_float64_in_a_stiff_body(material, rng):
         c, H = material.coefficients(placed(material, values, 1)).to(dtype), torch.zeros(1, 3, 3, dtype=dtype)
         memory = material.initial_memory(1, dtype)
         for _ in range(1000):
-            H, tau, memory = driver.advance(material, 1e-6, (A / 1e-6).to(dtype), H, c, memory)
+            H, tau, memory = advance(material, 1e-6, (A / 1e-6).to(dtype), H, c, memory)
         stress[dtype] = tau.double()
     error = (stress[torch.float32] - stress[torch.float64]).abs().max() / stress[torch.float64].abs().max()
-    assert error < 0.01  # the target of docs/method.md; with b formed from 1 + H it is 0.05, with F stored 1
+    assert error < 0.01  # as docs/method.md says, section 2; with b formed from 1 + H it is 0.05, with F stored 1
 
 
 def test_parameters_out_of_range_are_named(material):

@@ -6,10 +6,10 @@ from differences import compare
 from mpm_bodies import block, soft_world, tensors
 
 from physics3d.boundaries.fixed_region import FixedRegion
-from physics3d.filling.fill import Body
-from physics3d.gaussians.deform import embed
+from physics3d.filling.body import Body
+from physics3d.gaussians.embedding import embed
 from physics3d.log import Log
-from physics3d.materials import driver
+from physics3d.materials.material_points import advance
 from physics3d.materials.mixture import Mixture
 from physics3d.materials.neo_hookean import NeoHookean
 from physics3d.materials.viscoelastic import Viscoelastic
@@ -65,10 +65,10 @@ def test_a_bar_of_two_materials_carries_one_stress_through_the_interface():
         material = BAR.materials[name]
         c = material.coefficients(tensors({"youngs_modulus": E[name], "poissons_ratio": 0.0}))
         memory = material.initial_memory(int(at.sum()), torch.float64)
-        _, tau, _ = driver.advance(material, 0.0, torch.zeros_like(H[at]), H[at], c, memory)
+        _, tau, _ = advance(material, 1.0, H[at], torch.zeros_like(H[at]), c, memory)
         stress[name] = float((tau[:, 0, 0] / weight[at]).mean())
         compliance[name] = float((H[at, 0, 0] / weight[at]).mean())
-    # the target of docs/method.md is 5 %; seen 0.8 % and 0.3 %, of which up to 0.6 % are strain
+    # the cell at the interface blends both; seen 0.8 % and 0.3 %, of which up to 0.6 % are strain
     assert stress["stem"] == pytest.approx(1, rel=0.03) and stress["petal"] == pytest.approx(1, rel=0.03)
     assert compliance["petal"] / compliance["stem"] == pytest.approx(E["stem"] / E["petal"], rel=0.03)
 

@@ -63,7 +63,7 @@ def test_small_pictures_give_none_with_a_reason():
 
 
 @pytest.mark.parametrize("measure", [psnr, ssim, ms_ssim, vmaf, motion_psnr])
-def test_clips_of_different_shape_are_refused(measure):
+def test_clips_of_different_shape_are_refused(measure, unchecked):
     video = swinging(frames=4)
     with pytest.raises(ValueError, match="cannot compare"):
         measure(video[:3], video)

@@ -9,7 +9,10 @@ from physics3d.boundaries.base import Setting
 from physics3d.boundaries.enforced_rotation import EnforcedRotation
 from physics3d.boundaries.impulse import Impulse
 from physics3d.materials.viscoelastic import Viscoelastic
-from physics3d.mpm.substep import Substeps, start_warp
+from physics3d.mpm.arrays import Arrays
+from physics3d.mpm.hooks import hooks_of
+from physics3d.mpm.substep import Substeps
+from physics3d.warp_start import start_warp
 
 DX, STEPS = 0.1, 5
 
@@ -36,7 +39,8 @@ def substeps(material, *, fast: bool, moved: bool = False, threads: int = 1) -> 
     q = [boundary.parameters(setting) for boundary in boundaries]
     selection = [boundary.selection(setting) for boundary in boundaries]
     cells = position / DX
-    found = Substeps(
+    hooks = hooks_of(boundaries, [len(k) for k in q], real)
+    arrays = Arrays(
         dx=DX,
         origin=(0.0, 0.0, 0.0),
         gravity=(0.0, 0.0, -9.81),
@@ -48,23 +52,19 @@ def substeps(material, *, fast: bool, moved: bool = False, threads: int = 1) -> 
         coefficients=coefficients,
         q=torch.cat(q) if q else torch.zeros(0),
         selection=torch.stack(selection) if selection else torch.zeros(0, 0),
-        signals=sum(len(s) for s in signals),
-        pushes=((push.acceleration(real), 0, 2, 0),) if moved else (),
-        nodes=(),
-        touches=(),
-        steers=((turn.steer(real), len(q[0]), 2 + len(signals[0]), 1),) if moved else (),
+        hooks=hooks,
         walls=None,
-        material=material.advance(real),
         memory_rows=material.memory_rows,
         longest_run=STEPS,
         threads=threads,
         fast=fast,
     )
-    found.set_window((-3, -3, -3), (9, 9, 9))
-    first = found.state(0)
+    arrays.set_window((-3, -3, -3), (9, 9, 9))
+    first = arrays.state(0)
     first.v_gathered.copy_(torch.randn(n, 3, generator=torch.Generator().manual_seed(0)) * 0.01 * DX / dt)
     first.memory.copy_(material.initial_memory(n, torch.float64))
     clock = np.array([[dt, 0.99, *(x for s in signals for x in s)]] * STEPS)
+    found = Substeps(arrays, hooks, material.advance(real))
     found.start(np.array([[0.0, 1.0, *clock[0, 2:]]]), 0, 1)
     return found, clock
 
@@ -77,12 +77,12 @@ def compare(material, *, moved: bool, threads: int) -> None:
     assert fused.run(clock, path) == 0
     for i in path[1:]:
         for name in ("u", "v", "L", "tau", "H", "memory", "v_gathered", "L_gathered"):
-            a, b = getattr(plain.state(i), name), getattr(fused.state(i), name)
+            a, b = getattr(plain.arrays.state(i), name), getattr(fused.arrays.state(i), name)
             # double precision, another order of the sums
             torch.testing.assert_close(a, b, rtol=0, atol=1e-10 * max(float(a.abs().sum()), 1e-30))
     here, _ = substeps(material, fast=True, moved=moved, threads=threads)
     assert here.run(clock, [1] * (STEPS + 1)) == 0
-    assert torch.equal(here.state(1).flat, fused.state(STEPS + 1).flat)
+    assert torch.equal(here.arrays.state(1).flat, fused.arrays.state(STEPS + 1).flat)
 
 
 @pytest.mark.parametrize("material", every_material(), ids=repr)

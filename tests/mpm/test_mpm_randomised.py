@@ -54,8 +54,8 @@ MATERIALS = {
             branch_shear_modulus=powers(2, 9),
             branch_bulk_modulus=powers(2, 9),
             # viscosities from next to nothing to 1e12 Pa s and beyond
-            shear_viscosity_time=powers(-9, 6),
-            bulk_viscosity_time=powers(-9, 6),
+            shear_relaxation_time=powers(-9, 6),
+            bulk_relaxation_time=powers(-9, 6),
         )
     ),
     DruckerPrager(): st.fixed_dictionaries(elastic() | dict(friction_angle=st.floats(0.01, 1.5))),

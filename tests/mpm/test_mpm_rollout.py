@@ -158,8 +158,8 @@ def test_viscoelastic_bar():
         poissons_ratio=POISSON,
         branch_shear_modulus=MU_N,
         branch_bulk_modulus=K_N,
-        shear_viscosity_time=1 / K_D,
-        bulk_viscosity_time=1 / K_V,
+        shear_relaxation_time=1 / K_D,
+        bulk_relaxation_time=1 / K_V,
     )
     errors = []
     for cells in (16, 32):
@@ -301,15 +301,3 @@ def test_snow_packed_within_a_frame_does_not_burst():
     health = simulate(world, position, volume, frames=3, frame_dt=0.01, velocity=velocity).health
     assert max(health["energy"]) < health["energy"][0] * (1 + 1e-3) and max(health["rejected"]) > 0
     assert min(health["J_min"]) > 0.1 and max(health["J_max"]) < 1 + 1e-3
-
-
-def test_room_of_the_grid_does_not_grow_with_the_speed(monkeypatch):
-    """Under 1e6 m/s^2 the first, far too long substeps are rejected on a small grid, not tried on a huge one."""
-    monkeypatch.setattr("physics3d.mpm.rollout.MOST_NODES", 100**3)
-    position, volume = block((2, 2, 2), 0.1)
-    world = soft_world(gravity=(0.0, 0.0, -1e6))
-    trajectory = simulate(world, position, volume, frames=2, frame_dt=1e-3)
-    dt = trajectory.substep_dt
-    fallen = (trajectory.position[-1] - position)[:, 2]
-    # g t (t + dt)/2, as in free fall at any other acceleration
-    torch.testing.assert_close(fallen, torch.full_like(fallen, -1e6 * 1e-3 * (1e-3 + dt) / 2), atol=0, rtol=1e-9)

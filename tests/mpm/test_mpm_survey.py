@@ -6,6 +6,7 @@ import warp as wp
 
 from physics3d.mpm.state import make_state
 from physics3d.mpm.survey import survey
+from physics3d.warp_start import start_warp
 from physics3d.warp_types import vector
 
 
@@ -13,7 +14,7 @@ from physics3d.warp_types import vector
     "dtype, real, tolerance", [(torch.float32, wp.float32, 1e-5), (torch.float64, wp.float64, 1e-12)]
 )
 def test_survey_sees_what_torch_sees(dtype, real, tolerance):
-    wp.init()
+    start_warp()
     n, dx, generator = 200, 0.1, torch.Generator().manual_seed(0)
     state = make_state(n, 0, steered=False, dtype=dtype, device="cpu")
     state.flat.copy_(torch.randn(state.flat.shape, generator=generator))

@@ -1,11 +1,13 @@
 """What changes a fingerprint, and what must not."""
 
+import json
 import os
 from pathlib import Path
 
 import pytest
 
-from pipeline.fingerprint import _imports, _tree, _tree_digest, code_digest, content_digest, fingerprint
+from pipeline import fingerprint as module
+from pipeline.fingerprint import _imports, _reached, _tree, _tree_digest, code_digest, fingerprint, libraries
 
 STAGE = '''"""A stage."""
 from dataclasses import dataclass
@@ -40,7 +42,7 @@ def tree(tmp_path: Path) -> Path:
 
 
 def digest(root: Path) -> str:
-    for remembered in (code_digest, _imports, _tree, _tree_digest):
+    for remembered in (code_digest, libraries, _reached, _imports, _tree, _tree_digest):
         remembered.cache_clear()
     return code_digest(("stages.fill.Fill",), root)
 
@@ -89,12 +91,77 @@ def test_data_matters_by_content_not_by_place_or_time(tmp_path):
         (folder / "transforms.json").write_text("{}")
     os.utime(two / "images" / "0.png", (0, 0))
     known = tmp_path / "digests.json"
-    assert content_digest(one, known) == content_digest(two, known) == content_digest(one)
-    assert content_digest(one / "transforms.json") == content_digest(one)  # the file names images beside it
+
+    def key(path: Path, known: Path | None = None) -> str:
+        return fingerprint({"path": str(path)}, [], known)
+
+    assert key(one, known) == key(two, known) == key(one)
+    assert key(one / "transforms.json") == key(two / "transforms.json")
     (one / "images" / ".hidden").write_text("x")
-    assert content_digest(one, known) == content_digest(two, known)
+    (one / "images" / "again").symlink_to(one)  # a link that leads back
+    assert key(one, known) == key(two, known)
     (one / "images" / "0.png").write_bytes(b"abd")
-    assert content_digest(one, known) != content_digest(two, known)
+    assert key(one, known) != key(two, known)
+    (one / "transforms.json").write_text("[]")
+    assert key(one / "transforms.json") != key(two / "transforms.json")
+
+
+@pytest.mark.parametrize("damage", ["null", "[]", "{", "[" * 100000, '{"x": 1}', b"\xff"])
+def test_damaged_digests_only_cost_time(tmp_path, damage):
+    data, known = tmp_path / "model.ply", tmp_path / "digests.json"
+    data.write_bytes(b"abc")
+    right = fingerprint({"path": str(data)}, [], known)
+    known.write_bytes(damage if isinstance(damage, bytes) else damage.encode())
+    assert fingerprint({"path": str(data)}, [], known) == right
+    for entry in (None, [], [1, 2], [3, data.stat().st_mtime_ns, 7]):
+        known.write_text(json.dumps({str(data): entry}))
+        assert fingerprint({"path": str(data)}, [], known) == right
+
+
+def test_data_that_cannot_be_read_is_named(tmp_path):
+    os.mkfifo(tmp_path / "pipe.ply")  # reading it would wait for ever
+    with pytest.raises(ValueError, match=r"cannot read .*pipe\.ply"):
+        fingerprint({"path": str(tmp_path / "pipe.ply")}, [])
+
+
+def test_content_of_weights_matters(tmp_path, monkeypatch):
+    """A folder or file by what it holds, a repository of the hub by the commit that its cache holds."""
+    weights = tmp_path / "weights.pt"
+    weights.write_bytes(b"abc")
+    for entry in ("model", "weights"):
+        config = {"_target_": "stages.learn.Learn", "prior": {"_target_": "physics3d.priors.base.X", entry: ""}}
+
+        def key(value: object, config=config, entry=entry) -> str:
+            return fingerprint(config | {"prior": config["prior"] | {entry: str(value)}}, [])
+
+        before = key(weights)
+        weights.write_bytes(b"abd")
+        assert key(weights) != before
+        weights.write_bytes(b"abc")
+        assert key(weights) == before
+        monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / entry))
+        reference = tmp_path / entry / "models--someone--model" / "refs" / "main"
+        reference.parent.mkdir(parents=True)
+        keys = set()
+        for commit in ("a" * 40, "b" * 40):
+            reference.write_text(commit)
+            keys.add(key("someone/model"))
+        assert len(keys | {key("someone/other")}) == 3
+
+
+def test_versions_of_the_libraries_that_compute_matter(tree, monkeypatch):
+    """To the minor version, and only of those that the code reached imports."""
+    (tree / "physics3d/filling.py").write_text("def fill():\n    import scipy.spatial\n    import rich\n")
+    monkeypatch.setattr(module, "ROOT", tree)
+
+    def found(**versions: str) -> dict[str, str]:
+        digest(tree)  # forgets what was remembered
+        monkeypatch.setattr(module, "installed", lambda name: versions.get(name, "1.0.0"))
+        return libraries(("stages.fill.Fill",), tree)
+
+    assert found() == {"scipy": "1.0"} == found(scipy="1.0.9", torch="9.9", rich="2")
+    assert found(scipy="1.1.0") != found()
+    assert libraries(("stages.reconstruct.Reconstruct",)).keys() >= {"torch", "warp", "numpy"}  # of the real code
 
 
 def test_missing_data_says_how_to_name_it(tmp_path):

@@ -17,8 +17,41 @@ from pipeline.settings import CONF, GROUPS, SettingsError, choices, compose
         ("learn.stepss=50", r"no 'stepss' in learn; did you mean learn\.steps\?"),
         ("lern.steps=50", r"no 'lern'; did you mean learn\?"),
         ("simulate.qqqq=1", r"no 'qqqq' in simulate; there are .*fps"),
-        ("learn.steps=many", r"learn\.steps must be a number such as \d+, not many"),
-        ("verify=maybe", r"verify must be true or false, not maybe"),
+        ("learn.steps=many", r"learn\.steps is 'many'; take a whole number >= 0"),
+        ("verify=maybe", r"verify is 'maybe'; take true or false"),
+        # a number that cannot be
+        ("simulate.fps=0", r"simulate\.fps is 0; take a number > 0"),
+        ("simulate.frames=1", r"simulate\.frames is 1; take a whole number >= 2"),
+        ("learn.frames=4.5", r"learn\.frames is 4\.5; take a whole number"),
+        ("reconstruct.iterations=nan", r"reconstruct\.iterations is nan; take a whole number"),
+        ("reconstruct.max_gaussians=1e12", r"reconstruct\.max_gaussians is .*; take a whole number .* <= 1000000000"),
+        ("scene.dx=1e9", r"^scene\.dx is 1000000000\.0; take .* <= 10000 \[m\]"),
+        ("scene.spacing=5", r"^scene\.spacing is 5; take at most a cell, world\.dx = 0\.012 m"),
+        ("material.start.poissons_ratio=0.5", r"^material\.start\.poissons_ratio is 0\.5; take .* < 0\.5"),
+        ("learn.frames=500", r"^learn\.frames is 500; take at most the 30 of a take"),
+        # a name that does not exist
+        ("fill.isolated=burn", r"fill\.isolated is 'burn'; take one of attach, drop, keep"),
+        ("learn.learn=[youngs_modolus]", r"learn\.learn names 'youngs_modolus'; take some of youngs_modulus"),
+        ("learn.ties=[[youngs_modulus,youngs_modulus]]", r"learn\.ties names youngs_modulus twice"),
+        ("learn.world.dx=0.02", r"learn\.world\.dx is taken from scene\.dx; set scene\.dx"),
+        ("world.material=3", r"world\.material is 3; take a mapping with the _target_ of a AbstractMaterial"),
+        ("scene.source._target_=physics3d.scenes.ply.PlyScen", r"did you mean PlyScene\?"),
+        (
+            "prior._target_=physics3d.gaussians.densification.adaptive.Adaptive",
+            r"prior\._target_ is .*; take a class that is a AbstractPrior",
+        ),
+        # what belongs together
+        ("world.lower=[0,0,0]", r"world\.lower is \[0, 0, 0\] and upper null; take both corners, or neither"),
+        ("scene.prompts.0.box=[0.5,0,0.2,1]", r"scene\.prompts\.0\.box is .*; take left < right"),
+        ("scene.boundaries.0.upper=[-1,0,0]", r"scene\.boundaries\.0\.lower is .*; take a corner below upper"),
+        ("material=parts", r"names the parts \['plant'\]; take those that the material has, \['petals', 'stem'\]"),
+        ("scene.excitation=[]", r"no impulse in scene\.excitation has a force"),
+        # taken away, or added
+        ("~simulate.force.z", r"simulate\.force is .*; take x, y, z, each a number"),
+        ("~scene.dx", r"scene\.dx is not there, but others are taken from it; keep it"),
+        ("~reconstruct", r"reconstruct is null; only segment, learn, evaluate may be"),
+        ("+learn.foo=1", r"learn\.foo: Learn has no such field; there are world, prior"),
+        ("+foo=1", r"foo: there is no such entry; there are data, output"),
         ("carnation", r"'carnation' is not of the form key=value"),
         ("simulate.excitation=[", r"cannot read 'simulate\.excitation=\['"),
     ],
@@ -35,6 +68,21 @@ def test_overrides_reach_the_configuration():
     assert picked["profile"] == "smoke" and set(picked) == set(GROUPS)
 
 
+@pytest.mark.parametrize(
+    "word, path, value",
+    [
+        ("scene.source.seed=3", ("capture", "source", "seed"), 3),  # a field that no file mentions
+        ("world.scheme=implicit", ("simulate", "world", "scheme"), "implicit"),
+        ("material.start.stem.youngs_modulus=3e5", ("learn", "world", "start", "stem.youngs_modulus"), 3e5),
+    ],
+)
+def test_whatever_a_class_takes_can_be_set(word, path, value):
+    node, _ = compose(["scene=carnation_parts", word])
+    for name in path:
+        node = node[name]
+    assert node == value
+
+
 def run(*words: str) -> subprocess.CompletedProcess:
     call = [sys.executable, "-X", "importtime", "-m", "pipeline", *words]
     return subprocess.run(call, capture_output=True, text=True, cwd=CONF.parent)
@@ -49,7 +97,9 @@ def test_help_lists_what_there_is_and_imports_nothing_heavy():
     assert not re.search(r"\| +(torch|warp|prefect|mlflow|hydra)$", done.stderr, re.M)
 
 
-def test_a_mistake_ends_with_code_2():
-    done = run("scene=nowhere")
+@pytest.mark.parametrize("word", ["scene=nowhere", "learn.frames=4.5", "fill.isolated=burn"])
+def test_a_mistake_ends_with_code_2_and_before_anything_heavy_is_imported(word):
+    done = run(word)
     (line,) = [line for line in done.stderr.splitlines() if not line.startswith("import time")]
-    assert done.returncode == 2 and line.startswith("error: no scene 'nowhere'; there are ")
+    assert done.returncode == 2 and line.startswith("error: ")
+    assert not re.search(r"\| +(torch|warp|prefect|mlflow)$", done.stderr, re.M)

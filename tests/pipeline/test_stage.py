@@ -1,5 +1,7 @@
 """Reuse, damage and everything that may kill a run: nothing half-done looks finished, nothing finished is lost."""
 
+import hashlib
+import json
 import os
 import shutil
 import signal
@@ -9,13 +11,16 @@ import time
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
-from pipeline.stage import StageError, Step, build, damage, load, run
+from pipeline.stage import StageError, Step, build, damage, load, run, usual_seconds
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent.parent
 SCRIPT = """
-import sys
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # whoever runs the tests in the background ignores it
 from pathlib import Path
 from pipeline.stage import StageError
 from test_stage import chain
@@ -111,6 +116,146 @@ def test_damage_is_found_and_repaired(tmp_path, capsys, name):
     assert run_all(tmp_path, **changes) == [True, False, True, True]
     assert "b | the stored result is damaged" in capsys.readouterr().out
     assert damage(step) is None
+
+
+def manifest_with(**changes: object) -> str:
+    told = {"stage": "b", "fingerprint": "", "seconds": 1.0, "peak_rss_bytes": 1, "files": {"fields.json": [2, "x"]}}
+    return json.dumps(told | changes)
+
+
+MANIFESTS = {
+    "null": "null",
+    "list": "[]",
+    "text": '"b"',
+    "number": "1e999",
+    "nothing": "",
+    "cut off": '{"files": ',
+    "too deep": "[" * 100_000,
+    "no files": manifest_with(files={}),
+    "files is a list": manifest_with(files=[["fields.json", 1, "x"]]),
+    "files is null": manifest_with(files=None),
+    "entry is null": manifest_with(files={"fields.json": None}),
+    "entry is short": manifest_with(files={"fields.json": [1]}),
+    "entry of texts": manifest_with(files={"fields.json": ["1", "x"]}),
+    "size below zero": manifest_with(files={"fields.json": [-1, "x"]}),
+    "without the artifact": manifest_with(files={"log.txt": [0, "x"]}),
+    "a file elsewhere": manifest_with(files={"fields.json": [2, "x"], "/etc/passwd": [1, "x"]}),
+    "a file above": manifest_with(files={"fields.json": [2, "x"], "../x": [1, "x"]}),
+    "another stage": manifest_with(stage="c"),
+    "seconds is text": manifest_with(seconds="long"),
+    "no memory": manifest_with(peak_rss_bytes=None),
+}
+
+
+@pytest.mark.parametrize("text", MANIFESTS.values(), ids=MANIFESTS.keys())
+def test_a_manifest_that_is_none_of_ours_is_damage(tmp_path, text):
+    """Of whatever shape: the result is computed again, nobody sees a traceback."""
+    step = chain(tmp_path)[0]
+    run(step, "cpu")
+    (step.folder / "manifest.json").write_text(
+        text.replace('"fingerprint": ""', f'"fingerprint": "{step.fingerprint}"')
+    )
+    assert damage(step)
+    assert usual_seconds(step.shelf, "a") in (None, 1.0)
+    assert not run(step, "cpu").hit and damage(step) is None
+
+
+@given(
+    keys=st.lists(st.sampled_from(["stage", "fingerprint", "seconds", "peak_rss_bytes", "files"]), min_size=1),
+    value=st.recursive(
+        st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=3),
+        lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
+        max_leaves=5,
+    ),
+    whole=st.booleans(),
+)
+@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_any_other_manifest_is_damage_too(tmp_path, keys, value, whole):
+    step = Step("b", "b", {}, (), tmp_path / "artifacts", "0" * 16)
+    step.folder.mkdir(parents=True, exist_ok=True)
+    told = json.loads(manifest_with(fingerprint=step.fingerprint)) | dict.fromkeys(keys, value)
+    (step.folder / "manifest.json").write_text(json.dumps(value if whole else told))
+    assert damage(step)  # there is no such file as it names
+
+
+def spoil(folder: Path, how: str) -> None:
+    """Put something else where a result was filed."""
+    elsewhere = folder.parent / "elsewhere"
+    if how == "a link to a whole one":
+        folder.rename(elsewhere)
+        folder.symlink_to(elsewhere)
+        return
+    if how == "a linked file":
+        (folder / "fields.json").rename(elsewhere)
+        (folder / "fields.json").symlink_to(elsewhere)
+        return
+    if how == "a folder as manifest":
+        (folder / "manifest.json").unlink()
+        (folder / "manifest.json").mkdir()
+        return
+    if how == "a pipe as manifest":  # reading it would wait for ever
+        (folder / "manifest.json").unlink()
+        os.mkfifo(folder / "manifest.json")
+        return
+    shutil.rmtree(folder)
+    match how:
+        case "a file":
+            folder.write_text("x")
+        case "a broken link":
+            folder.symlink_to("nowhere")
+        case "a link to itself":
+            folder.symlink_to(folder.name)
+        case "an empty folder":
+            folder.mkdir()
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        *("a file", "a broken link", "a link to itself", "an empty folder", "a link to a whole one", "a linked file"),
+        *("a folder as manifest", "a pipe as manifest"),
+    ],
+)
+def test_something_else_in_the_place_of_a_result_is_replaced(tmp_path, how):
+    step = chain(tmp_path)[0]
+    run(step, "cpu")
+    spoil(step.folder, how)
+    assert damage(step)
+    assert not run(step, "cpu").hit
+    assert damage(step) is None and step.folder.is_dir() and not step.folder.is_symlink()
+
+
+@pytest.mark.parametrize("leftover", ["a file", "a broken link"])
+def test_something_in_the_place_of_an_unfinished_result_is_replaced(tmp_path, leftover):
+    step = chain(tmp_path)[0]
+    unfinished = step.folder.with_name(f".{step.fingerprint}")
+    unfinished.mkdir(parents=True)
+    spoil(unfinished, leftover)
+    assert not run(step, "cpu").hit and not os.path.lexists(unfinished)
+
+
+def test_a_result_of_other_contents_is_computed_again_when_it_is_needed(tmp_path, capsys):
+    """The files are what the manifest says, and yet they are no artifact: made by hand, or by other code."""
+    first, second = chain(tmp_path)[:2]
+    run(first, "cpu")
+    told = json.loads((first.folder / "manifest.json").read_text())
+    for text in ("null", '{"__class__": "subprocess:Popen", "fields": {}}', "[" * 100_000):
+        (first.folder / "fields.json").write_text(text)
+        told["files"]["fields.json"] = [len(text), hashlib.sha256(text.encode()).hexdigest()]
+        (first.folder / "manifest.json").write_text(json.dumps(told))
+        assert damage(first) is None
+        shutil.rmtree(second.folder, ignore_errors=True)
+        assert not run(second, "cpu").hit
+        assert "a | the stored result is damaged" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("place", ["artifacts", "artifacts/a", "artifacts/.locks"])
+def test_a_shelf_that_cannot_be_is_one_line(tmp_path, place):
+    (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / place).write_text("x")
+    with pytest.raises(StageError, match=r"^a: .*(Not a directory|File exists)") as caught:
+        run_all(tmp_path)
+    assert "\n" not in str(caught.value)
 
 
 def test_large_files_are_checked_by_content_on_request(tmp_path):

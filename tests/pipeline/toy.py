@@ -13,15 +13,48 @@ from physics3d.metrics.scores import Scores
 from physics3d.scenes.base import Capture, Take
 from physics3d.video import Video
 from physics3d.world import Estimate
+from pipeline.flow import STAGES
+
+
+def configuration(folder: Path, **changes: dict) -> dict:
+    """A whole experiment of throw-away stages; `changes` are entries of the stages' configurations."""
+    config: dict = {name: {"_target_": "toy.Add", "amount": 1, "name": name} for name in STAGES}
+    for name in STAGES:
+        config[name]["diary"] = str(folder / "diary")
+    diary = str(folder / "diary")
+    config["capture"] = {"_target_": "toy.Photograph", "roles": ["learn", "evaluate"], "diary": diary}
+    config["guess"] = {"_target_": "toy.Material", "modulus": 1.0, "diary": diary, "name": "guess"}
+    config["learn"] = {"_target_": "toy.Material", "modulus": 1.5, "diary": diary, "name": "learn"}
+    config["evaluate"] = {"_target_": "toy.Compare", "diary": diary}
+    for name, change in changes.items():
+        config[name] = None if change is None else config[name] | change
+    rest = {"output": str(folder), "device": "cpu", "verify": False, "scene": {"name": "toy"}, "seed": 0}
+    return config | rest
+
+
+ALL = [
+    *("capture", "guess", "reconstruct", "segment", "fill", "learn", "simulate", "render"),
+    *("simulate_initial", "render_initial", "evaluate"),
+]
 
 
 def clip(value: float) -> Video:
     return Video(frames=(torch.full((2, 4, 4, 3), int(value), dtype=torch.uint8),), fps=1.0, names=("toy",))
 
 
+def note(diary: str, name: str) -> None:
+    """Append a name to a diary, and stay as long as there is a file "stop in <name>" beside it."""
+    if not diary:
+        return
+    with Path(diary).open("a") as lines:
+        lines.write(name + "\n")
+    while (Path(diary).parent / f"stop in {name}").exists():
+        time.sleep(0.02)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Add:
-    """Adds `amount` to the pixels of its inputs. Every run appends its name to the file `diary`."""
+    """Adds `amount` to the pixels of its inputs."""
 
     amount: int
     diary: str
@@ -33,8 +66,7 @@ class Add:
     table: dict[str, float] = field(default_factory=dict)
 
     def __call__(self, *inputs: object, log: Log) -> Video:
-        with Path(self.diary).open("a") as lines:
-            lines.write(self.name + "\n")
+        note(self.diary, self.name)
         log.info(f"adding {self.amount}")
         for step in range(3):
             log.metric("curve", self.amount / (step + 1), step)
@@ -55,8 +87,10 @@ class Photograph:
     roles: tuple[str, ...] = ()
     single_object: bool = False
     trained: bool = False
+    diary: str = ""
 
     def __call__(self, *, log: Log) -> Capture:
+        note(self.diary, "capture")
         camera = Camera(width=8, height=8, fx=8.0, fy=8.0, cx=4.0, cy=4.0, world_to_camera=torch.eye(4).double())
         return Capture(
             name="toy",
@@ -79,8 +113,11 @@ class Material:
     modulus: float
     seconds: float = 0.0
     error: str = ""
+    diary: str = ""
+    name: str = ""
 
     def __call__(self, *inputs: object, log: Log) -> Estimate:
+        note(self.diary, self.name)
         log.info("estimating")
         log.metric("loss", 1.0, 0)
         time.sleep(self.seconds)
@@ -93,9 +130,12 @@ class Material:
 class Compare:
     """Scores the first pixel of the videos."""
 
+    diary: str = ""
+
     def __call__(
         self, capture: Capture, videos: dict[str, Video], estimates: dict[str, Estimate], *, log: Log
     ) -> Scores:
+        note(self.diary, "evaluate")
         assert videos.keys() == estimates.keys()
         return Scores(
             values={k: {"psnr": float(v.frames[0][0, 0, 0, 0]), "vmaf": None} for k, v in videos.items()},

@@ -142,9 +142,9 @@ def spoil_image(folder: Path) -> Path:
     return file
 
 
-def lose_image(folder: Path) -> Path:
+def empty_image(folder: Path) -> Path:
     file = sorted(folder.rglob("*.png"))[0]
-    file.unlink()
+    file.write_bytes(b"")
     return file
 
 
@@ -155,13 +155,11 @@ def resize_image(folder: Path) -> Path:
     return file
 
 
-@pytest.mark.parametrize("spoil", [spoil_image, lose_image, resize_image])
+@pytest.mark.parametrize("spoil", [spoil_image, empty_image, resize_image])
 @pytest.mark.parametrize("kind", ["pinhole", "colmap_text", "colmap_binary", "pac_nerf"])
 def test_a_bad_image_is_named(kind, spoil, tmp_path):
     source = write(kind, tmp_path, Axes(up=(0.0, 1.0, 0.0), scale=1.0))
     name = spoil(tmp_path).name
-    if kind == "pac_nerf" and spoil is lose_image:
-        name = "a_C_0.png"  # every camera needs its first frame
     with pytest.raises(ValueError, match=name):
         source(log=Log(None))
 
@@ -243,21 +241,11 @@ def test_impossible_settings_are_named(kind, change, tmp_path):
         replace(source, **change)(log=Log(None))
 
 
-def test_distortion_is_ignored_below_half_a_pixel_and_refused_above(tmp_path):
-    source = write("colmap_text", tmp_path, Z_UP)
-    file = tmp_path / "sparse/0/cameras.txt"
-    line = "{} SIMPLE_RADIAL 48 36 60.0 24.0 18.0 {}\n"
-    # the corner is at radius 0.5: k1 moves it by 60 * 0.125 * k1 = 7.5 k1 pixels
-    file.write_text(line.format(1, 0.05) + line.format(2, -0.05))
-    assert source(log=Log(None)).cameras[0].fx == 60
-    file.write_text(line.format(1, 0.08) + line.format(2, 0.08))
-    with pytest.raises(ValueError, match="undistorter"):
-        source(log=Log(None))
-
-
 def test_an_image_without_alpha_among_mattes_is_named(tmp_path):
     source = write("blender", tmp_path, Z_UP)
     file = tmp_path / "images" / "03.png"
-    Image.open(file).convert("RGBA").save(file)
+    picture = Image.open(file).convert("RGBA")
+    picture.putpixel((0, 0), (0, 0, 0, 0))
+    picture.save(file)
     with pytest.raises(ValueError, match=r"00\.png has no alpha"):
         source(log=Log(None))

@@ -47,6 +47,11 @@ def test_a_twin_has_two_different_takes_from_the_same_rest(twin):
     assert (learn.videos[0][-1] != learn.videos[0][0]).any()
 
 
+def test_a_twin_announces_what_it_will_be(twin):
+    source, capture = twin
+    assert source.outline == capture.outline
+
+
 def test_the_truth_is_what_the_reference_world_uses(twin):
     source, capture = twin
     assert set(capture.truth) == set(Viscoelastic().parameters)
@@ -115,3 +120,18 @@ def test_a_push_moves_the_blossom_where_it_points():
     assert cosine > 0.98 and np.linalg.norm(direction) > 0.005
     # nodes below the soil are held; a particle under them only feels its neighbours in the next cell
     assert np.abs(moved[position[:, 2] < 0.055]).max() < 1e-4
+
+
+@pytest.mark.parametrize("name", TWINS)
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"views": 0}, {"views": 2.5}, {"width": 0}, {"frames": 1}, {"points": 0},
+        {"fps": 0.0}, {"fps": float("nan")}, {"dx": -0.01}, {"density": float("inf")}, {"frames": float("nan")},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_a_twin_that_cannot_be_filmed_is_named_at_once(name, change):
+    ((field, value),) = change.items()
+    with pytest.raises(ValueError, match=f"source.{field} is {value}"):
+        replace(TWINS[name], **change)(log=Log(None))

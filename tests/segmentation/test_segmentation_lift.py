@@ -10,19 +10,17 @@ from analytic_bodies import cameras_around, captured, discs, joined, sphere, sph
 from physics3d.gaussians.rasterize import rasterize
 from physics3d.gaussians.render import render
 from physics3d.log import Log
-from physics3d.segmentation.lift import (
-    NEGLIGIBLE,
-    contributions,
-    expected,
-    islands,
-    lift,
-    one_hot,
-    shares,
-    touching,
-    trust,
-)
-from physics3d.segmentation.masks import AbstractVideoMasker, GrabCut
-from physics3d.segmentation.prompts import Prompt, Room, View, along_path, carry_masks, contested, overlap
+from physics3d.segmentation.belief import expected, one_hot, shares
+from physics3d.segmentation.carry_masks import along_path, carry_masks
+from physics3d.segmentation.claims import contested
+from physics3d.segmentation.lift import NEGLIGIBLE, contributions, lift, trust
+from physics3d.segmentation.maskers.base import AbstractVideoMasker
+from physics3d.segmentation.maskers.grabcut import GrabCut
+from physics3d.segmentation.neighbours import beside_static, islands
+from physics3d.segmentation.pixels import intersection_over_union
+from physics3d.segmentation.prompts import Prompt
+from physics3d.segmentation.rooms import Room
+from physics3d.segmentation.views import View
 
 CAMERAS = cameras_around(10, 0.4)
 
@@ -173,7 +171,7 @@ def test_a_mask_reaches_the_far_side(scene):
     for view in others:
         true = (true_map(gaussians, truth, view.camera) == 1).numpy()
         if view.index in masks:
-            assert overlap(masks[view.index]["red"], true) > 0.8, view.name
+            assert intersection_over_union(masks[view.index]["red"], true) > 0.8, view.name
 
 
 def test_a_video_masker_gets_the_views_along_the_path_of_the_cameras(scene):
@@ -198,7 +196,7 @@ def test_what_a_video_masker_followed_is_carried(scene):
     masks = carry_masks(gaussians, first, {"red": true[first.index]}, rooms, others, Knows(), log=Log(None))
     # and where it lost the object the view is left out
     assert set(masks) == {first.index, others[0].index}
-    assert overlap(masks[others[0].index]["red"], true[others[0].index]) > 0.95
+    assert intersection_over_union(masks[others[0].index]["red"], true[others[0].index]) > 0.95
 
 
 def test_islands_are_the_small_clusters_apart():
@@ -214,19 +212,19 @@ def test_islands_are_the_small_clusters_apart():
 def test_touching_gaussians_are_those_next_to_static_ones():
     x = torch.linspace(0, 1, 401)
     mean = torch.stack([x, 0 * x, 0 * x], 1)
-    found = touching(mean, torch.ones(401), (x > 0.5).to(torch.int32))
+    found = beside_static(mean, torch.ones(401), (x > 0.5).to(torch.int32))
     assert found.any() and float(x[found].max()) < 0.53 and not found[x <= 0.5].any()
 
 
 @pytest.mark.parametrize(
     ("prompt", "remedy"),
     [
-        ({"positive": ((1.2, 0.5),)}, "is outside the image; give fractions"),
-        ({"box": (10, 20, 200, 300)}, "as fractions of width and height"),
+        ({"positive": ((1.2, 0.5),)}, "positive.0.0 is 1.2; take a number >= 0 and <= 1"),
+        ({"box": (10, 20, 200, 300)}, "box.0 is 10; take a number >= 0 and <= 1"),
         ({"box": (0.6, 0.1, 0.3, 0.9)}, "left < right"),
-        ({"lower": (0, 0, 0)}, "both lower and upper"),
+        ({"lower": (0, 0, 0)}, "take both corners, or neither"),
         ({"lower": (0, 0, 1), "upper": (1, 1, 0)}, "below upper"),
-        ({}, "give positive points, a box, or"),
+        ({}, "take at least one of positive, box, lower"),
     ],
 )
 def test_a_prompt_that_cannot_be_is_refused(prompt, remedy):

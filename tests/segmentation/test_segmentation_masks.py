@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from physics3d.segmentation.masks import GrabCut, Sam2, Sam2Video, build_sam2
+from physics3d.segmentation.maskers.grabcut import GrabCut
+from physics3d.segmentation.maskers.sam2 import Sam2, Sam2Video, build_sam2
 
 NOTHING = np.zeros((0, 2))
 
@@ -94,7 +95,7 @@ def test_sam2_with_random_weights_returns_a_mask_of_the_image(tmp_path):
     assert [m.shape for m in found] == [(100, 120), (100, 120), (80, 120)] and all(m.dtype == bool for m in found)
     assert np.array_equal(found[1], given)
 
-    with pytest.raises(ValueError, match=r"segment.masker.weights=.* does not fit"):
+    with pytest.raises(ValueError, match=r"masker.weights=.* does not fit"):
         torch.save({"model": {"a": torch.zeros(1)}}, weights)
         _ = Sam2(config=config, weights=str(weights), image_size=size).predictor
 
@@ -103,7 +104,7 @@ def test_sam2_names_the_key_when_weights_are_absent(monkeypatch):
     from huggingface_hub import constants
 
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
-    with pytest.raises(ValueError, match=r"segment.masker.weights=nobody/sam2-none .*GrabCut"):
+    with pytest.raises(ValueError, match=r"masker.weights=nobody/sam2-none .*GrabCut"):
         _ = Sam2(weights="nobody/sam2-none", image_size=128).predictor
-    with pytest.raises(ValueError, match=r"segment.masker.config=sam9 is none of sam2.1/sam2.1_hiera_b\+"):
+    with pytest.raises(ValueError, match=r"masker.config=sam9 is none of sam2.1/sam2.1_hiera_b\+"):
         _ = Sam2(config="sam9").predictor

@@ -9,11 +9,12 @@ import torch
 from physics3d.boundaries.impulse import Impulse
 from physics3d.gaussians.cameras import Camera
 from physics3d.log import Log
-from physics3d.metrics.scores import Scores
+from physics3d.metrics.comparable import same
+from physics3d.metrics.scores import FROZEN, REFERENCE, Scores
 from physics3d.scenes.base import Capture, Take
 from physics3d.video import Video
 from physics3d.world import Estimate
-from stages.evaluate import FROZEN, REFERENCE, Evaluate, same
+from stages.evaluate import Evaluate
 
 FPS, H, W = 30.0, 60, 80
 

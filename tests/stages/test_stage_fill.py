@@ -7,7 +7,7 @@ import pytest
 import torch
 from analytic_bodies import discs, joined, sphere
 
-from physics3d.filling.fill import Body
+from physics3d.filling.body import Body
 from physics3d.log import Log
 from physics3d.scenes.base import Capture
 from physics3d.segmentation import Segmentation
@@ -53,5 +53,5 @@ def test_labels_of_another_reconstruction_are_refused(two_balls):
 
 
 def test_attach_is_auto_or_none(two_balls):
-    with pytest.raises(ValueError, match=r"fill.attach is 'glue'; take auto or none"):
+    with pytest.raises(ValueError, match=r"fill.attach is 'glue'; take one of auto, none"):
         Fill(spacing=0.008, attach="glue")(bare(two_balls), two_balls, None, log=Log(None))

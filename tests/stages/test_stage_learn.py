@@ -6,7 +6,9 @@ import pytest
 import torch
 from small_scene import ELASTIC, bar, capture, learner
 
+from physics3d.learning.chain import chain_of
 from physics3d.log import Log
+from physics3d.scenes.base import Footage
 from physics3d.world import Estimate
 
 START = ELASTIC | {"youngs_modulus": 7e3}
@@ -72,10 +74,46 @@ def test_no_steps_no_search_leaves_the_start(clip):
     assert float(estimate.parameters["youngs_modulus"]) == pytest.approx(7e3)
 
 
+def test_without_a_modulus_there_is_no_search_for_a_stiffness_and_that_is_said(clip, tmp_path):
+    stage = learner(START, ("poissons_ratio",), search=3, steps=0)
+    estimate = stage(clip, *bar(), log=Log(tmp_path, quiet=True))
+    assert float(estimate.parameters["youngs_modulus"]) == pytest.approx(7e3)
+    assert "no coarse search" in (tmp_path / "log.txt").read_text()
+
+
 def test_frames_span_the_duration(clip):
     stage = learner(START, ("youngs_modulus",), frames=4)
-    assert stage.indices(clip.takes[0]).tolist() == [0, 3, 6, 9]
-    assert replace(stage, duration=0.2, frames=3).indices(clip.takes[0]).tolist() == [0, 2, 4]
+    assert stage.spread(clip.takes[0].footage).tolist() == [0, 3, 6, 9]
+    assert replace(stage, duration=0.2, frames=3).spread(clip.takes[0].footage).tolist() == [0, 2, 4]
+
+
+def test_however_many_frames_are_taken_they_cover_the_take():
+    """16 of 30 are not the first 16: nothing as long as the mean distance between two is left out at either end."""
+    for total in range(2, 40):
+        take = Footage(name="poke", role="learn", frames=total, fps=30.0)
+        for count in range(2, total + 1):
+            at = replace(learner(START, ("youngs_modulus",)), frames=count).spread(take)
+            steps = at.diff()
+            assert len(at) == count and at[0] == 0
+            assert total - 1 - int(at[-1]) < (total - 1) / (count - 1)
+            assert int(steps.min()) >= 1 and int(steps.max()) - int(steps.min()) <= 1, "as even as frames allow"
+
+
+def test_frames_that_are_not_equally_far_apart_are_compared_with_the_same_instants(clip):
+    """At the true parameters what is rendered is what was recorded, to the rounding to 8 bits; a frame too early or
+    too late is not."""
+    stage = learner(ELASTIC, ("youngs_modulus",), frames=7)
+    gaussians, body = bar()
+    field = stage.field(stage.world.estimate(), speed=1.0)
+    found = {}
+    for at in (stage.spread(clip.takes[0].footage), torch.arange(7)):
+        how = dict(image_scale=1.0, device="cpu", log=Log(None))
+        chain = chain_of(stage.world, stage.prior, field, clip, gaussians, body, clip.takes[0], at, **how)
+        drawn = chain.render(chain.simulate(field.zero()), 0, torch.arange(7))
+        found[tuple(at.tolist())] = drawn
+        assert float((drawn - clip.takes[0].videos[0][at].float() / 255).abs().max()) <= 0.5 / 255 + 1e-3
+    spread, first = found.values()
+    assert float((spread - first).abs().max()) > 20 / 255
 
 
 @pytest.mark.parametrize(
@@ -83,18 +121,37 @@ def test_frames_span_the_duration(clip):
     [
         ({"frames": 11}, "has 10 frames"),
         ({"frames": 9, "duration": 0.2}, "raise learn.duration"),
-        ({"learn": ("stiffness",)}, "youngs_modulus"),
-        ({"learn": ("poissons_ratio",), "search": 3}, "no modulus"),
     ],
 )
 def test_what_does_not_fit_the_take_is_refused(clip, change, word):
     stage = replace(learner(START, ("youngs_modulus",)), **change)
     with pytest.raises(ValueError, match=word):
+        stage.fits(clip.outline)  # before any work
+    with pytest.raises(ValueError, match=word):
         stage(clip, *bar(), log=Log(None))
 
 
 @pytest.mark.parametrize(
-    "change", [{"frames": 1}, {"learning_rate": 0.0}, {"search_span": 1.0}, {"steps": -1}, {"stay": -1.0}]
+    "change, word",
+    [({"learn": ("stiffness",)}, "learn.learn names 'stiffness'; take some of youngs_modulus"),
+     ({"learn": ("poissons_ratio",), "ties": (("poissons_ratio", "youngs_modulus"),)}, "no scale to share")],
+)  # fmt: skip
+def test_what_does_not_fit_the_material_is_refused_when_it_is_said(change, word):
+    with pytest.raises(ValueError, match=word):
+        learner(START, change.pop("learn"), **change)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"frames": 1},
+        {"learning_rate": 0.0},
+        {"search_span": 1.0},
+        {"steps": -1},
+        {"stay": -1.0},
+        {"search": 1},
+        {"span": 1},
+    ],
 )
 def test_impossible_options_are_refused(change):
     with pytest.raises(ValueError, match=f"learn.{next(iter(change))}"):
@@ -104,3 +161,16 @@ def test_impossible_options_are_refused(change):
 def test_a_capture_without_a_take_is_refused(clip):
     with pytest.raises(ValueError, match="no take with role learn"):
         learner(START, ("youngs_modulus",))(replace(clip, takes=()), *bar(), log=Log(None))
+
+
+def test_what_cannot_be_learned_from_is_found_before_learning_begins(clip, tmp_path):
+    """... and not after minutes: the push of the take misses the body; a cell is larger than the body."""
+    log = Log(tmp_path, quiet=True)
+    gaussians, body = bar()
+    away = replace(body, position=body.position + torch.tensor([5.0, 0.0, 0.0]))
+    stage = learner(START, ("youngs_modulus",))
+    with pytest.raises(ValueError, match=r"Impulse.* holds none of .* the body lies in \(4\.9"):
+        stage(clip, gaussians, away, log=log)
+    with pytest.raises(ValueError, match=r"world.dx is 2 m.* smaller than a cell"):
+        replace(stage, world=replace(stage.world, dx=2.0))(clip, gaussians, body, log=log)
+    assert not (tmp_path / "log.txt").exists()

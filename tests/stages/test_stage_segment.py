@@ -98,7 +98,7 @@ def test_nonsense_is_refused_with_a_remedy(scene):
         run(Prompt(box=(0.0, 0.0, 0.01, 0.01)))
     with pytest.raises(ValueError, match=r"view 'nowhere.png' is not in analytic; .* view_00.png"):
         run(Prompt(view="nowhere.png", box=(0.1, 0.1, 0.5, 0.5)))
-    with pytest.raises(ValueError, match=r"point \(0.5, 1.5\) is outside the image"):
+    with pytest.raises(ValueError, match=r"positive\.0\.1 is 1\.5; take a number >= 0 and <= 1"):
         run(Prompt(positive=((0.5, 1.5),)))
     with pytest.raises(ValueError, match="in several views"):
         run(Prompt(view=0, box=(0.1, 0.1, 0.5, 0.5)), Prompt(view=1, box=(0.1, 0.1, 0.5, 0.5)))

@@ -8,11 +8,11 @@ import torch
 
 from physics3d.boundaries.half_space import HalfSpace
 from physics3d.boundaries.impulse import Impulse
-from physics3d.filling.fill import Body
-from physics3d.gaussians.deform import embed
+from physics3d.filling.body import Body
+from physics3d.gaussians.embedding import embed
 from physics3d.log import METRICS, Log
 from physics3d.materials.neo_hookean import NeoHookean
-from physics3d.mpm.rollout import Trajectory
+from physics3d.trajectory import Trajectory
 from physics3d.world import World
 from stages.simulate import Simulate
 
@@ -65,6 +65,24 @@ def test_initial_velocity_of_the_estimate_is_used(body):
     # uniform motion, single precision
     expected = body.position + torch.tensor((0.06, 0.0, 0.0))
     torch.testing.assert_close(x[-1], expected, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("dx, word", [(0.3, r"smaller than a cell; take world.dx <= 0\.013 m"), (0.19, None)])
+def test_a_body_smaller_than_a_cell_is_refused(body, dx, word):
+    """0.2 m wide: 4 particles, 0.05 m apart. A fifteenth of that is 0.0133 m."""
+    run = lambda: Simulate(world=replace(WORLD, dx=dx), frames=2, fps=100.0)(body, WORLD.estimate(), log=Log(None))
+    if word is None:
+        run()
+    else:
+        with pytest.raises(ValueError, match=word):
+            run()
+
+
+def test_a_force_that_nothing_takes_is_refused(body):
+    shake = Impulse(acceleration_of_each=(1.0, 0.0, 0.0), nearest=3, centre=(0.0, 0.0, 0.0), duration=0.1)
+    stage = Simulate(world=WORLD, frames=2, fps=100.0, excitation=(shake,), force={"x": 1.0, "y": 0.0, "z": 0.0})
+    with pytest.raises(ValueError, match=r"simulate\.force is .* no impulse .* could replace"):
+        stage(body, WORLD.estimate(), log=Log(None))
 
 
 @pytest.mark.parametrize("fps", [0.0, -1.0, float("nan"), float("inf")])

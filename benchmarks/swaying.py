@@ -1,0 +1,260 @@
+"""The solver without a grid against closed forms and against finite elements.
+
+    make bench-swaying [ARGS="rows=beam,plant"]   ->   docs/results/swaying.csv, .md, .png
+
+Beams: Timoshenko (transfer matrix), clamped along an axis and free where turned. Plate and L-shape: quadratic hexahedra
+on a mesh that fits; the plant of the carnation twin: quadratic tetrahedra. Both by scikit-fem, the tetrahedra by
+fTetWild (`pip install scikit-fem pytetwild pyvista`); without them these rows have no truth and are left out.
+Bodies are filled as the pipeline fills them: a lattice of `spacing` through a closed surface. Times are processor time
+of one thread, for the machine is shared.
+"""
+
+import csv
+import math
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "modes"))
+from machine import machine
+from modes_bodies import row, section, timoshenko, turned_beam, world
+
+from physics3d.boundaries.fixed_region import FixedRegion
+from physics3d.filling.cells import solid_cells
+from physics3d.log import Log
+from physics3d.modes.rollout import Solver
+from physics3d.scenes.flower import SOIL, plant
+
+RESULTS = Path(__file__).resolve().parent.parent / "docs" / "results"
+YOUNG, POISSON, DENSITY = 1.5e5, 0.3, 300.0
+
+
+def main(words: list[str]) -> None:
+    options = dict(word.split("=", 1) for word in words)
+    chosen = options["rows"].split(",") if "rows" in options else ["beam", "turned", "plate", "L", "plant"]
+    torch.set_num_threads(1)
+    rows: list[dict] = []
+    for name in chosen:
+        for found in BODIES[name]():
+            print(found, flush=True)
+            rows.append(found)
+    write(rows)
+
+
+def measured(body: str, truth: list[float], of: str, skip: int = 0, pair: bool = False, **more) -> dict:
+    """A row: frequencies of the splines and of the reduced model against a truth [Hz]."""
+    begin = time.process_time()
+    solver = Solver.of(log=Log(None), **more)
+    seconds = time.process_time() - begin
+    full, reduced = (omega[skip:] / (2 * math.pi) for omega in (solver.model.exact_omega, solver.model.omega))
+    if pair:  # both planes of bending have the same
+        truth = [f for f in truth for _ in range(2)]
+    n = len(truth)
+    off = lambda found: max(abs(a / b - 1) for a, b in zip(found[:n], truth))
+    return dict(
+        body=body, truth=of, exact=" ".join(f"{f:.3g}" for f in truth), splines=" ".join(f"{f:.3g}" for f in full[:n]),
+        reduced=" ".join(f"{f:.3g}" for f in reduced[:n]), error=off(full), error_reduced=off(reduced),
+        fields=solver.model.count, points=len(solver.model.weight), seconds=seconds,
+    )  # fmt: skip
+
+
+def beams():
+    """Clamped, along an axis, one particle across."""
+    thick = 0.006
+    for slender in (10, 30, 60):
+        area, inertia, shear = section("square", thick, POISSON)
+        truth = timoshenko(slender * thick, area, inertia, YOUNG, POISSON, DENSITY, shear, free=False)
+        position, volume = row(slender, thick)
+        yield measured(
+            f"clamped square beam, L/h {slender}, one particle across", truth, "Timoshenko", pair=True,
+            world=world(YOUNG, POISSON), position=position, volume=volume,
+        )  # fmt: skip
+
+
+def turned():
+    thick, slender = 0.012, 20
+    for shape in ("square", "round"):
+        for degrees in (0, 30, 45):
+            area, inertia, shear = section(shape, thick, POISSON)
+            truth = timoshenko(slender * thick, area, inertia, YOUNG, POISSON, DENSITY, shear, free=True)
+            position, volume, matter = turned_beam(slender * thick, thick, shape, degrees, 0.006, 0.37)
+            yield measured(
+                f"free {shape} beam, L/h {slender}, two particles across, turned by {degrees} degrees", truth,
+                "Timoshenko", skip=6, pair=True, world=world(YOUNG, POISSON, boundaries=()), position=position,
+                volume=volume, matter=matter,
+            )  # fmt: skip
+
+
+def boxes(name: str, size: tuple[float, float, float], hole: tuple | None, cells: tuple[int, int, int]):
+    """A box of this size [m], without the corner beyond `hole`, clamped at x = 0."""
+
+    def inside(x: np.ndarray) -> np.ndarray:
+        found = ((x >= 0) & (x <= size)).all(1)
+        return found if hole is None else found & ~(x > hole).all(1)
+
+    truth = hexahedra(size, hole, cells)
+    clamp = FixedRegion(lower=(-1.0, -1.0, -1.0), upper=(0.0, 1.0, 1.0))
+    for spacing in (0.004, 0.006):
+        corners = np.array([[0.0, 0.0, 0.0], size])
+        position, volume, matter = solid_cells(inside, corners + np.array([[0.0], [0.3 * spacing]]), spacing)
+        yield measured(
+            f"{name}, spacing {1e3 * spacing:g} mm", truth, "hexahedra",
+            world=world(YOUNG, POISSON, boundaries=(clamp,)), position=torch.from_numpy(position),
+            volume=torch.from_numpy(volume), matter=matter,
+        )  # fmt: skip
+
+
+def plants():
+    """The carnation twin's own solids."""
+    inside, vertices = plant_solid()
+    truth = tetrahedra(inside, vertices)
+    clamp = FixedRegion(lower=(-0.1, -0.1, -0.1), upper=(0.1, 0.1, SOIL))
+    for spacing in (0.004, 0.005, 0.006, 0.008):
+        position, volume, matter = solid_cells(inside, vertices, spacing)
+        yield measured(
+            f"the twin's plant, spacing {1e3 * spacing:g} mm", truth, "tetrahedra",
+            world=world(YOUNG, POISSON, boundaries=(clamp,)), position=torch.from_numpy(position),
+            volume=torch.from_numpy(volume), matter=matter,
+        )  # fmt: skip
+
+
+def plant_solid() -> tuple[Callable[[np.ndarray], np.ndarray], np.ndarray]:
+    """(which points [m, 3] are inside one of the twin's solids, vertices of their surfaces)."""
+    from physics3d.open3d_import import open3d
+
+    o3d = open3d()
+    _, solids = plant(0)
+    scenes = []
+    for mesh in solids:
+        scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+        scene.add_triangles(o3d.core.Tensor(mesh.vertices), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
+        scenes.append(scene)
+
+    def inside(x: np.ndarray) -> np.ndarray:
+        query = o3d.core.Tensor(x.astype(np.float32))
+        return np.any([s.compute_occupancy(query, nthreads=1).numpy() > 0.5 for s in scenes], axis=0)
+
+    return inside, np.concatenate([mesh.vertices for mesh in solids]).astype(float)
+
+
+BODIES = {
+    "beam": beams,
+    "turned": turned,
+    "plate": lambda: boxes("clamped plate 120 x 60 x 6 mm", (0.12, 0.06, 0.006), None, (20, 10, 1)),
+    "L": lambda: boxes(
+        "L-shape, arms of 96 mm, 12 mm square", (0.096, 0.012, 0.096), (0.012, -1.0, 0.012), (16, 2, 16)
+    ),
+    "plant": plants,
+}
+
+
+# --- finite elements by a library -------------------------------------------------------------------------------------
+
+
+def hexahedra(size, hole, cells) -> list[float]:
+    """First four frequencies [Hz] of a box without a corner, clamped at x = 0: 27 nodes to a hexahedron."""
+    from skfem import Basis, ElementHex2, ElementVector, MeshHex
+
+    mesh = MeshHex.init_tensor(*(np.linspace(0, s, n + 1) for s, n in zip(size, cells)))
+    if hole is not None:
+        middle = mesh.p[:, mesh.t].mean(1).T
+        mesh = mesh.restrict(np.flatnonzero(~(middle > hole).all(1)))
+    return frequencies(Basis(mesh, ElementVector(ElementHex2())), lambda x: x[0] < 1e-9)
+
+
+def tetrahedra(inside, vertices) -> list[float]:
+    """First four frequencies [Hz] of the twin's plant above the soil: 10 nodes to a tetrahedron."""
+    import pytetwild
+    from skfem import Basis, ElementTetP2, ElementVector, MeshTet
+
+    from physics3d.open3d_import import open3d
+
+    o3d = open3d()
+    _, solids = plant(0)
+    v, f, n = [], [], 0
+    for solid in solids:
+        mesh = o3d.geometry.TriangleMesh(
+            o3d.utility.Vector3dVector(solid.vertices.astype(float)), o3d.utility.Vector3iVector(solid.faces)
+        )
+        mesh.remove_duplicated_vertices().remove_degenerate_triangles()
+        v.append(np.asarray(mesh.vertices)), f.append(np.asarray(mesh.triangles) + n)
+        n += len(v[-1])
+    points, cells = pytetwild.tetrahedralize(
+        np.concatenate(v), np.concatenate(f).astype(np.int32), edge_length_fac=0.03, optimize=True
+    )[:2]
+    middle = points[cells].mean(1)
+    cells = cells[inside(middle) & (middle[:, 2] > SOIL - 0.004)]
+    mesh = MeshTet(np.ascontiguousarray(points.T), np.ascontiguousarray(cells.T)).remove_unused_nodes()
+    return frequencies(Basis(mesh, ElementVector(ElementTetP2())), lambda x: x[2] < SOIL)
+
+
+def frequencies(basis, clamped) -> list[float]:
+    """The lowest four [Hz]."""
+    from scipy.sparse.linalg import eigsh
+    from skfem import BilinearForm, condense
+    from skfem.helpers import ddot, dot, eye, sym_grad, trace
+
+    mu, lam = YOUNG / (2 * (1 + POISSON)), YOUNG * POISSON / ((1 + POISSON) * (1 - 2 * POISSON))
+
+    @BilinearForm
+    def elastic(u, v, w):
+        e = sym_grad(u)
+        return ddot(2 * mu * e + lam * eye(trace(e), 3), sym_grad(v))
+
+    @BilinearForm
+    def inertia(u, v, w):
+        return DENSITY * dot(u, v)
+
+    held = basis.get_dofs(nodes=np.flatnonzero(clamped(basis.mesh.p))).flatten()
+    held = np.unique(np.concatenate([held, np.flatnonzero(clamped(basis.doflocs))]))
+    K, M, *_ = condense(elastic.assemble(basis), inertia.assemble(basis), D=held)
+    found = eigsh(K.tocsc(), k=4, M=M.tocsc(), sigma=0.0, return_eigenvectors=False)
+    return [float(f) for f in np.sqrt(np.sort(found)) / (2 * math.pi)]
+
+
+# --- the page ---------------------------------------------------------------------------------------------------------
+
+
+def write(rows: list[dict]) -> None:
+    title = f"{machine('cpu')}, 1 thread"
+    with (RESULTS / "swaying.csv").open("w", newline="") as file:
+        file.write(f"# {title}\n")
+        table = csv.DictWriter(file, list(rows[0]))
+        table.writeheader()
+        table.writerows(rows)
+    draw(rows)
+    lines = ["# Things that are held and sway: the solver without a grid", "", "Made by `make bench-swaying`.", ""]
+    lines += [f"Machine: {title}. Shared with other work.", "", *__doc__.split("\n\n", 2)[2].strip().splitlines(), ""]
+    lines += ["![errors](swaying.png)", ""]
+    lines += ["| body | truth | exact [Hz] | splines | reduced | error | reduced | fields | points | to build [s] |"]
+    lines += ["|---|---|---|---|---|---|---|---|---|---|"]
+    for r in rows:
+        numbers = [f"{100 * r['error']:.1f} %", f"{100 * r['error_reduced']:.1f} %", r["fields"], r["points"]]
+        cells = [r["body"], r["truth"], r["exact"], r["splines"], r["reduced"], *numbers, f"{r['seconds']:.1f}"]
+        lines.append("| " + " | ".join(str(cell) for cell in cells) + " |")
+    lines += ["", "Errors are the largest of the frequencies in the row.", ""]
+    (RESULTS / "swaying.md").write_text("\n".join(lines))
+
+
+def draw(rows: list[dict]) -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 0.32 * len(rows) + 1.2), layout="constrained")
+    axis = figure.subplots()
+    place = np.arange(len(rows))
+    for shift, name in ((-0.18, "error"), (0.18, "error_reduced")):
+        label = {"error": "splines", "error_reduced": "reduced"}[name]
+        axis.barh(place + shift, [100 * r[name] for r in rows], 0.34, label=label)
+    axis.set_yticks(place, [r["body"] for r in rows], fontsize=7)
+    axis.invert_yaxis()
+    axis.set(xlabel="largest error of the frequencies [%]")
+    axis.legend(fontsize=8)
+    figure.savefig(RESULTS / "swaying.png", dpi=100)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,79 @@
+"""How theta becomes a motion, a motion a clip, and which clips of a take it is compared with."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from physics3d.filling.body import Body
+from physics3d.gaussians.deform import Backdrop, render_deformed
+from physics3d.gaussians.model import Gaussians
+from physics3d.learning.fields import GlobalField
+from physics3d.learning.loss import Chain
+from physics3d.log import Log
+from physics3d.priors.base import AbstractPrior
+from physics3d.scenes.base import Capture, Take
+from physics3d.solver import motion_of
+from physics3d.world import World
+
+
+def chain_of(
+    world: World,
+    prior: AbstractPrior,
+    field: GlobalField,
+    capture: Capture,
+    gaussians: Gaussians,
+    body: Body,
+    take: Take,
+    indices: Tensor,
+    *,
+    image_scale: float,
+    device: str,
+    log: Log,
+) -> Chain:
+    """Of the frames `indices`, ascending from 0, of the cameras of the take that are not held out.
+
+    Pictures are drawn at `image_scale` of the take's size. Raises ValueError if all cameras are held out.
+    """
+    views = [i for i in range(len(take.cameras)) if i not in take.held_out_cameras]
+    if not views:
+        raise ValueError(f"take {take.name}: all cameras are held out; leave one to learn from")
+    cameras = {i: take.cameras[i].scaled(image_scale) for i in views}
+    clips = {}
+    for i in views:
+        video = take.videos[i][indices].permute(0, 3, 1, 2).to(device, torch.float32) / 255
+        size = (cameras[i].height, cameras[i].width)
+        clips[i] = torch.nn.functional.interpolate(video, size, mode="area").permute(0, 2, 3, 1)
+    model, embedding = gaussians.to(device), body.embedding
+    rest, volume = body.position.to(device), body.volume.to(device)
+    background = torch.tensor(capture.background, dtype=torch.float32, device=device)
+    backdrops = {i: Backdrop.of(model, embedding, cameras[i], background=background) for i in views}
+    # rolled out at the largest step of which all frames are multiples
+    step = math.gcd(*indices.tolist())
+    at = (indices // step).tolist()
+
+    part = lambda values: world.material.per_part(values, body.part, body.parts)
+    motion = motion_of(
+        world,
+        rest,
+        volume,
+        excitation=(*body.held, *(take.excitation or ())),
+        part=part,
+        matter=body.matter,
+        device=device,
+        log=log,
+    )
+
+    def simulate(theta: Tensor):
+        timing = dict(frames=at[-1] + 1, frame_dt=step / take.fps, log=Log(None))
+        return motion(part(field.parameters(theta)), velocity=field.velocity(theta), **timing)
+
+    def render(motion, view: int, frames: Tensor) -> Tensor:
+        draw = lambda x, F: (
+            render_deformed(
+                model, embedding, rest, x, F, cameras[view], background=background, backdrop=backdrops[view]
+            ).color
+        )
+        return torch.stack([draw(motion.position[at[i]], motion.deformation[at[i]]) for i in frames.tolist()]).float()
+
+    return Chain(simulate=simulate, render=render, clips=clips, prior=prior)

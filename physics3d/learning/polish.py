@@ -1,0 +1,39 @@
+"""Levenberg's steps after the descent: forward runs only, where one parameter stands in for another."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from physics3d.learning.fields import GlobalField
+from physics3d.learning.linear import linearise
+from physics3d.learning.loss import Chain
+from physics3d.log import Log
+
+
+def polish(
+    chain: Chain, field: GlobalField, theta: Tensor, *, steps: int, stay: float, seed: int, log: Log
+) -> Float[Tensor, " k"]:
+    """Levenberg's steps on L: what Adam leaves undone in narrow valleys where one parameter stands in for another.
+
+        (J^T J + stay L_0 + m max diag J^T J) d = -(J^T (z0 - x0_hat) + stay L_0 theta)
+
+    m grows by 8 on failure and falls by 4 on success. It is the same for all components, so that one which the pictures
+    hardly show moves least.
+    """
+    unit, m = max(chain.measure(field.zero(), seed), 1e-12), 1e-3
+    total = lambda t: chain.measure(t, seed) + 0.5 * stay * unit * float(t.square().sum())
+    now, around = total(theta), None
+    for step in log.progress(range(steps), "polishing"):
+        around = around or linearise(chain, field, theta, seed=seed)
+        pull = stay * unit
+        A = around.JJ + (m * around.JJ.diagonal().max() + pull + 1e-9 * unit) * torch.eye(len(theta)).double()
+        d = torch.linalg.solve(A, -(around.Jr + pull * theta))
+        trial = field.bound(theta + d.clamp(-1, 1))  # at most a factor e at once
+        then = total(trial)
+        log.metric("polish/loss", min(now, then), step)
+        if then < now:
+            theta, now, around, m = trial, then, None, m / 4
+        else:
+            m *= 8
+    log.info(f"polished: loss {chain.measure(theta, seed):.5g}")
+    return theta

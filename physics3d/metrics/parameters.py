@@ -1,0 +1,24 @@
+"""Parameters against the truth, where a scene knows it."""
+
+import math
+
+import torch
+
+from physics3d.world import Estimate
+
+
+def parameter_errors(estimates: dict[str, Estimate], truth: dict[str, float]) -> dict[str, dict[str, float | None]]:
+    """ "learned: youngs_modulus" -> value, truth, error [%], ln(value/truth); means over particles of a field."""
+    table: dict[str, dict[str, float | None]] = {}
+    for parameter, true in truth.items():
+        for row, estimate in estimates.items():
+            if parameter in estimate.parameters:
+                value = float(torch.as_tensor(estimate.parameters[parameter]).double().mean())
+                positive = value > 0 and true > 0
+                table[f"{row}: {parameter}"] = {
+                    "value": value,
+                    "truth": float(true),
+                    "error_percent": 100 * (value - true) / abs(true) if true else None,
+                    "log_ratio": math.log(value / true) if positive else None,
+                }
+    return table

@@ -1,0 +1,308 @@
+"""A body as the solver without a grid sees it: everything that does not change from one run to the next.
+
+    matter (pieces, points)  ->  splines  ->  stiffness, mass  ->  static responses, modes of vibration
+                                                               ->  a basis of few fields, few points
+
+Built once, with the parameters that the world starts from; a learned material moves in the same basis.
+"""
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy import sparse
+from torch import Tensor
+
+from physics3d.boundaries.base import AbstractBoundary, Setting
+from physics3d.log import Log
+from physics3d.materials.base import Values
+from physics3d.matter import Matter, in_one_piece, of_particles, points
+from physics3d.modes import basis, cubature, lattice, vibration
+from physics3d.modes.conditions import Conditions, Refused, conditions
+from physics3d.modes.dynamics import TOLERANCE, Spring, System
+from physics3d.modes.stress import Points
+from physics3d.world import World
+
+CELL = (
+    1,
+    1.5,
+    2,
+    3,
+    4,
+    6,
+    8,
+)  # spacing of the splines, in edges of a piece: the first with at most MOST_SPLINES of them
+MOST_SPLINES = 1500
+PIN = 1e3  # stiffness of a pin, in that of a cube of the piece behind it
+MODES = 12  # of vibration, whose components are fields of the basis
+QUADRATURE = 500  # points of integration
+SMOOTH = 30.0  # times the highest mode: what would swing faster is smoothed out of a start
+MOST_GROUPS = 8  # materials that differ; more are a field
+
+
+@dataclass(frozen=True, kw_only=True)
+class Model:
+    """A body in a basis of r functions s_j: u(X) = sum_j s_j(X) q_j, q [r, 3] in m."""
+
+    world: World
+    conditions: Conditions
+    values: np.ndarray  # s_j at the particles [p, r]
+    slopes: np.ndarray  # their gradients at the particles [3 p, r] [1/m]
+    gradient: np.ndarray  # at the points of integration [3 n, r] [1/m]
+    weight: np.ndarray  # [n] [m^3]
+    owner: np.ndarray  # [n] particle
+    mass: np.ndarray  # [r, r] [kg]
+    stiffness: np.ndarray  # at rest, pins included, all dash-pots stuck [3 r, 3 r] [N/m]
+    first_moment: np.ndarray  # int rho s_j [r] [kg]
+    load_fields: np.ndarray  # int rho s_j weight of each load [b, r] [kg]
+    springs: tuple[Spring, ...]
+    particle_mass: np.ndarray  # [p] [kg]
+    omega: np.ndarray  # of the modes with all dash-pots stuck [1/s]
+    shapes: np.ndarray  # their amplitudes [m, r, 3], of unit mass
+    exact_omega: np.ndarray  # the same of the splines, before the reduction [1/s]
+
+    @functools.cached_property
+    def projection(self) -> np.ndarray:
+        """[3 r, 3 free particles]: amplitudes of the smoothest field that has given vectors at the particles,
+
+            minimise sum_p m_p |sum_j s_j(X_p) a_j - v_p|^2 + a.K a/(SMOOTH omega_max)^2
+
+        What the particles do not say, how a section one particle across turns, is then as the body would have it."""
+        free = ~self.conditions.held
+        S = self.values[free]
+        left = S.T * self.particle_mass[free]
+        matrix = np.kron(left @ S, np.eye(3)) + self.stiffness / (SMOOTH * self.omega.max()) ** 2
+        matrix += 1e-12 * np.trace(matrix) / len(matrix) * np.eye(len(matrix))
+        return np.linalg.solve(matrix, np.kron(left, np.eye(3)))
+
+    @property
+    def count(self) -> int:
+        return self.values.shape[1]
+
+    def system(self, coefficients: np.ndarray) -> System:
+        """Ready to run from the undeformed state; coefficients [k, n] at the points of integration."""
+        return System(
+            gradient=self.gradient,
+            mass=self.mass,
+            points=Points(self.world.material, coefficients, self.weight),
+            springs=self.springs,
+            drag=self.world.damping,
+            tolerance=TOLERANCE[self.world.dtype],
+        )
+
+    def at_points(self, coefficients: Tensor) -> Tensor:
+        """Coefficients [k, 1 or p] of the particles -> [k, n] of the points."""
+        return coefficients.expand(-1, len(self.values_rows))[:, torch.from_numpy(self.owner)]
+
+    @property
+    def values_rows(self) -> range:
+        return range(self.values.shape[0])
+
+    def modes(self, coefficients: np.ndarray) -> list[vibration.Mode]:
+        """Frequencies and loss factors of the modes of vibration, their shapes those of the stuck dash-pots."""
+        strain = np.stack([(self.gradient @ shape).reshape(-1, 3, 3) for shape in self.shapes])
+        kappa = vibration.relaxation(self.world.material, coefficients, self.weight, strain)
+        held = np.array([sum(np.vdot(s, k.matrix @ s) for k in self.springs if k.pull is None) for s in self.shapes])
+        return vibration.damped(lambda t: kappa(t) + held)
+
+
+def model(
+    world: World,
+    position: Tensor,
+    volume: Tensor,
+    *,
+    parameters: Values,
+    boundaries: Sequence[AbstractBoundary],
+    matter: Matter | None = None,
+    modes: int = MODES,
+    points_: int = QUADRATURE,
+    log: Log,
+) -> Model:
+    """The model of particles at `position` [p, 3] m of `volume` [p] m^3, each a cube of the body unless `matter` says
+    better. `parameters` are those whose modes of vibration the basis is made of. Raises Refused (a ValueError) where
+    a boundary needs the grid."""
+    x, V = position.detach().cpu().double(), volume.detach().cpu().double()
+    corner = x.amin(0).tolist(), x.amax(0).tolist()
+    setting = Setting(position=x, mass=world.density * V, lower=corner[0], upper=corner[1], dx=world.dx)
+    if matter is None:
+        matter = of_particles(x, V)
+    found = conditions(boundaries, setting, in_one_piece(matter))
+    matter = found.matter
+    size = matter.size
+    at, weight, piece = points(matter)
+    # where the particles are, on the piece of theirs that is nearest
+    seat = _seats(x.numpy(), matter)
+    free = np.flatnonzero(seat >= 0)
+    pins = found.pins
+    places = np.concatenate([at, *(p.position for p in pins), x.numpy()[free]])
+    pieces = np.concatenate([piece, *(p.piece for p in pins), seat[free]])
+    for cell in CELL:
+        splines = lattice.splines(places, pieces, matter.links.numpy(), len(matter.position), cell * size)
+        if splines.count <= MOST_SPLINES:
+            break
+    N, G = splines.at(at, piece)
+    owner = matter.owner.numpy()[piece]
+
+    coefficients = world.material.coefficients({k: torch.as_tensor(v).double() for k, v in parameters.items()})
+    coefficients = coefficients.detach().cpu().expand(-1, len(x)).numpy()[:, owner]
+    modulus = world.material.wave_modulus(torch.from_numpy(coefficients)).numpy()
+    stuck = Points(world.material, coefficients, weight)
+    K = vibration.stiffness(G, stuck.tangent(np.zeros((len(weight), 3, 3)), vibration.STUCK))
+    scalar_mass = (N.T @ sparse.diags(world.density * weight) @ N).tocsr()
+    M = sparse.kron(scalar_mass, sparse.identity(3), format="csr")
+
+    stiff = np.zeros(len(matter.position))
+    np.maximum.at(stiff, piece, modulus)
+    permanent = sparse.csr_matrix((splines.count, splines.count))
+    for p in pins:
+        S, _ = splines.at(p.position, p.piece)
+        permanent = permanent + S.T @ sparse.diags(PIN * stiff[p.piece] / size * p.area) @ S
+    held = permanent.nnz > 0
+    springs = [Spring(matrix=permanent)] if held else []
+    # functions that hold next to no matter do not make matrices singular
+    faint = np.full(splines.count, vibration.FAINT * float(np.median(modulus)) * splines.H)
+    for grip in found.grips:
+        mine = grip.particles[owner]
+        if not mine.any():
+            raise Refused("a moved or held region has no free matter in it")
+        k = np.where(mine, PIN * modulus * weight / size**2, 0.0)
+        matrix = N.T @ sparse.diags(k) @ N
+        first = np.stack([N.T @ k, *(N.T @ (k * (at[:, a] - grip.point[a])) for a in range(3))], 1)
+        springs.append(Spring(matrix=matrix.tocsr(), pull=_pull(grip, first), until=grip.until))
+    load_weight = np.array([load.weight[owner] for load in found.loads]).reshape(-1, len(owner))
+    load_fields = (N.T @ (world.density * weight * load_weight).T).T
+    first_moment = N.T @ (world.density * weight)
+
+    span = float(np.linalg.norm(np.ptp(at, axis=0)))
+    values, slopes = _at_particles(splines, x.numpy(), seat)
+    rest = (permanent + sparse.diags(faint)).tocsr()
+    shift = _shift(world, modulus, span, held)
+    exact, shapes = vibration.modes((K + _three(rest)).tocsr(), M, modes + (0 if held else 6), shift=shift)
+    log.info(
+        f"{len(matter.position)} pieces, {splines.count} splines {1e3 * splines.H:.3g} mm apart, {len(weight)} points"
+    )
+    # Rayleigh's quotients: what was added to keep the matrix regular changes shapes a little, and these not at all
+    elastic = K + _three(permanent)
+    exact = np.maximum(np.einsum("nm,nm->m", shapes, elastic @ shapes), 0.0)
+    swings = np.ones(len(exact), bool) if held else exact > 1e-3 * exact[6]  # no rigid motion
+    fields = [shapes[:, swings]]
+    sources = [*load_fields] + ([first_moment] if any(world.gravity) else [])
+    rigid = shapes[:, ~swings]
+    responses = _responses((K + _three(rest) + shift * M).tocsr(), sources, M, rigid)
+    if responses.size:
+        fields.append(responses)
+    if found.grips:
+        gripped = rest + sum(s.matrix for s in springs if s.pull is not None)
+        everything = (K + _three(gripped)).tocsr()
+        _, more = vibration.modes(everything, M, modes, shift=shift)
+        pulls = [s.pull.first[:, k] for s in springs if s.pull is not None for k in range(4)]
+        fields += [more, _responses((everything + shift * M).tocsr(), [*sources, *pulls], M, rigid[:, :0])]
+    scalars = basis.turned(np.concatenate(fields, 1), G, weight)
+    if not held:
+        affine = (splines.affine() - [0, *at.mean(0)]) * [span, 1, 1, 1] / np.sqrt(weight.sum())
+        scalars = np.concatenate([affine, scalars], 1)
+    C = basis.independent(scalars, N, G, weight, span)
+    slopes_there, still = G @ C, np.zeros((len(weight), 3, 3))
+    tangent = stuck.tangent(still, vibration.STUCK)
+    K = vibration.stiffness(slopes_there, tangent)
+    group = _groups(coefficients)
+    if group.max() + 1 > MOST_GROUPS:  # a field of parameters: every particle counts
+        which, factor = np.arange(len(weight)), np.ones(len(weight))
+    else:
+        whole = K + np.kron(C.T @ (rest @ C), np.eye(3))
+        _, own_modes = vibration.dense_modes(whole, np.kron(C.T @ (scalar_mass @ C), np.eye(3)), modes, shift=shift)
+        which, factor = cubature.chosen(slopes_there, tangent, whole, own_modes, group, points_)
+    slopes_there = np.ascontiguousarray(slopes_there.reshape(len(weight), 3, -1)[which].reshape(3 * len(which), -1))
+    K = vibration.stiffness(slopes_there, tangent[:, which] * factor[:, None, None])
+    K += np.kron(C.T @ (permanent @ C), np.eye(3))
+    mass = C.T @ (scalar_mass @ C)
+    lowest, shapes = vibration.dense_modes(K, np.kron(mass, np.eye(3)), len(exact), shift=shift)
+    off = np.abs(np.sqrt(np.maximum(lowest / exact, 0))[swings][:4] - 1)
+    log.info(
+        f"basis of {C.shape[1]} fields, integrated at {len(which)} points: its first frequencies are within "
+        f"{100 * off.max(initial=0):.2g} % of those of the splines"
+    )
+    return Model(
+        world=world,
+        conditions=found,
+        values=values @ C,
+        slopes=slopes @ C,
+        gradient=slopes_there,
+        weight=weight[which] * factor,
+        owner=owner[which],
+        mass=mass,
+        stiffness=K,
+        first_moment=C.T @ first_moment,
+        load_fields=load_fields @ C,
+        springs=tuple(_in_basis(s, C) for s in springs),
+        particle_mass=setting.mass.numpy(),
+        omega=np.sqrt(np.maximum(lowest, 0)),
+        shapes=shapes.T.reshape(-1, C.shape[1], 3),
+        exact_omega=np.sqrt(np.maximum(exact, 0)),
+    )
+
+
+class _pull:
+    """matrix times the target of a grip: `first` are int k s_j (1, X - point)."""
+
+    def __init__(self, grip, first: np.ndarray):
+        self.grip, self.first = grip, first
+
+    def __call__(self, t: float) -> np.ndarray:
+        turn, way = self.grip.motion(t)
+        return self.first[:, :1] * way + self.first[:, 1:] @ turn.T
+
+
+def _in_basis(spring: Spring, C: np.ndarray) -> Spring:
+    pull = None if spring.pull is None else _pull(spring.pull.grip, C.T @ spring.pull.first)
+    return Spring(matrix=C.T @ (spring.matrix @ C), pull=pull, until=spring.until)
+
+
+def _three(scalar: sparse.spmatrix) -> sparse.csr_matrix:
+    return sparse.kron(scalar, sparse.identity(3), format="csr")
+
+
+def _shift(world: World, modulus: np.ndarray, span: float, held: bool) -> float:
+    """What makes the stiffness of a free body positive [1/s^2]: far below any vibration."""
+    return (1e-6 if held else 1e-4) * float(np.median(modulus)) / (world.density * span**2)
+
+
+def _responses(K: sparse.csr_matrix, sources: list[np.ndarray], M: sparse.csr_matrix, rigid: np.ndarray) -> np.ndarray:
+    """Static responses [3 f, k] to each scalar source along each axis, relative to the `rigid` motions [3 f, n] of a
+    free body, M-orthonormal: under a force it accelerates, and bends by what the force differs from its inertia."""
+    if not sources:
+        return np.zeros((K.shape[0], 0))
+    columns = np.concatenate([np.kron(s[:, None], np.eye(3)[:, [i]]) for s in sources for i in range(3)], 1)
+    relieved = columns - M @ (rigid @ (rigid.T @ columns))
+    bends = np.abs(relieved).max(0) > 1e-6 * np.abs(columns).max(0)
+    if not bends.any():
+        return np.zeros((K.shape[0], 0))
+    found = vibration.Factor(K)(relieved[:, bends])
+    return found - rigid @ (rigid.T @ (M @ found))
+
+
+def _groups(coefficients: np.ndarray) -> np.ndarray:
+    """Points of the same material have the same number."""
+    _, group = np.unique(coefficients, axis=1, return_inverse=True)
+    return group.reshape(-1)
+
+
+def _seats(x: np.ndarray, matter: Matter) -> np.ndarray:
+    """The piece [p] of each particle that is nearest to it; -1: it has none, it is held."""
+    seat = np.full(len(x), -1)
+    owner, at = matter.owner.numpy(), matter.position.numpy()
+    distance = np.linalg.norm(at - x[owner], axis=1)
+    order = np.lexsort((distance, owner))
+    first, where = np.unique(owner[order], return_index=True)
+    seat[first] = order[where]
+    return seat
+
+
+def _at_particles(splines: lattice.Splines, x: np.ndarray, seat: np.ndarray):
+    """Values [p, count] and gradients [3 p, count] at the particles, zero where they are held."""
+    free = np.flatnonzero(seat >= 0)
+    N, G = splines.at(x[free], seat[free])
+    spread = sparse.csr_matrix((np.ones(len(free)), (free, np.arange(len(free)))), shape=(len(x), len(free)))
+    return (spread @ N).tocsr(), (sparse.kron(spread, sparse.identity(3), format="csr") @ G).tocsr()

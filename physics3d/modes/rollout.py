@@ -1,0 +1,354 @@
+"""A whole trajectory as one differentiable function, without a grid: the same face as `physics3d/mpm/rollout.py`.
+
+    rollout(world, parameters, position, volume, ...) -> Trajectory
+    Solver(world, position, volume, ...).rollout(parameters, ...)       the same, the model of the body built once
+
+Time step. Errors of the midpoint rule in the frequency of a mode are (omega dt)^2/12. The automatic step is 1/STEPS of
+the period of the fastest mode that the loads and the start put a hundredth of the energy into, and at most a frame; all
+steps of a frame are equal. A frame that Newton cannot solve is done again with twice as many, up to TRIES times, then
+refused.
+
+Gradients. The exact adjoint of the discrete motion in the basis, with respect to parameters, velocity and the forces of
+boundaries; the basis and the places of the particles are given. What is kept of a step is its r x 3 amplitudes and the
+history at the points of integration, however many particles there are.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from physics3d.artifact import require_finite
+from physics3d.boundaries.base import AbstractBoundary
+from physics3d.log import Log
+from physics3d.materials.base import Values
+from physics3d.materials.mixture import PART
+from physics3d.matter import Matter
+from physics3d.modes.dynamics import NotSolved, Step, System
+from physics3d.modes.model import MODES, QUADRATURE, Model, model
+from physics3d.modes.vibration import Mode
+from physics3d.trajectory import Trajectory
+from physics3d.world import World
+
+STEPS = 24  # in a period of the fastest mode that matters
+SHARE = 0.01  # of the energy, from which on a mode matters
+TRIES = 6
+
+
+def rollout(
+    world: World,
+    parameters: Values,
+    position: Float[Tensor, "p 3"],
+    volume: Float[Tensor, " p"],
+    *,
+    velocity: Float[Tensor, "p 3"] | Float[Tensor, "3"] | None = None,
+    excitation: tuple[AbstractBoundary, ...] = (),
+    frames: int,
+    frame_dt: float,
+    device: str = "cpu",
+    threads: int | None = None,
+    matter: Matter | None = None,
+    log: Log,
+) -> Trajectory:
+    """As the function of the same name with a grid; `matter` are the pieces of the body, if they are better known than
+    as cubes around the particles. Computed on the CPU, on one thread; `device` is where the trajectory goes. Raises
+    ValueError naming the field, the value and the remedy."""
+    solver = Solver.of(
+        world, position, volume, excitation=excitation, part=parameters.get(PART), matter=matter, log=log
+    )
+    return solver.rollout(parameters, velocity=velocity, frames=frames, frame_dt=frame_dt, device=device, log=log)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Solver:
+    """The model of a body under its boundaries and excitation, ready for any parameters and start."""
+
+    world: World
+    position: Tensor
+    volume: Tensor
+    model: Model
+
+    @classmethod
+    def of(
+        cls,
+        world: World,
+        position: Float[Tensor, "p 3"],
+        volume: Float[Tensor, " p"],
+        *,
+        excitation: tuple[AbstractBoundary, ...] = (),
+        part: Tensor | None = None,
+        matter: Matter | None = None,
+        modes: int = MODES,
+        points: int = QUADRATURE,
+        log: Log,
+    ) -> "Solver":
+        """`part` [p] where the material is a mixture. Raises ValueError as `rollout` does."""
+        world.check()
+        _check_body(position, volume)
+        start: Values = {name: torch.tensor(value, dtype=torch.float64) for name, value in world.start.items()}
+        if part is not None:
+            start[PART] = part
+        built = model(
+            world,
+            position,
+            volume,
+            parameters=start,
+            boundaries=(*world.boundaries, *excitation),
+            matter=matter,
+            modes=modes,
+            points_=points,
+            log=log,
+        )
+        return cls(world=world, position=position, volume=volume, model=built)
+
+    def coefficients(self, parameters: Values) -> Float[Tensor, "k n"]:
+        """Of the material at the points of integration; differentiable."""
+        found = self.world.material.coefficients({k: torch.as_tensor(v).double().cpu() for k, v in parameters.items()})
+        return found.expand(-1, len(self.position))[:, torch.from_numpy(self.model.owner)]
+
+    def modes(self, parameters: Values) -> list[Mode]:
+        """The lowest modes of vibration about the undeformed state."""
+        return self.model.modes(self.coefficients(parameters).detach().numpy())
+
+    def statics(
+        self, parameters: Values, load: AbstractBoundary | None = None, *, gravity: bool = False
+    ) -> Float[Tensor, "p 3"]:
+        """Displacement of the particles [m] in equilibrium, a long time after the force of `load`, one of the
+        excitation, and gravity have begun to act. Raises ValueError if there is none."""
+        body, loads = self.model, self._loads().detach().numpy()
+        total = np.zeros((body.count, 3))
+        if gravity:
+            total += loads[0]
+        if load is not None:
+            which = next(i for i, known in enumerate(body.conditions.loads) if known.boundary is load)
+            total += loads[1 + which]
+        system = body.system(self.coefficients(parameters).detach().numpy())
+        try:
+            return torch.from_numpy(body.values @ system.statics(np.zeros_like(total), total))
+        except NotSolved as reason:
+            raise ValueError(f"no equilibrium was found: {reason}; take a weaker force or a stiffer material") from None
+
+    def rollout(
+        self,
+        parameters: Values,
+        *,
+        velocity: Float[Tensor, "p 3"] | Float[Tensor, "3"] | None = None,
+        frames: int,
+        frame_dt: float,
+        device: str = "cpu",
+        log: Log,
+    ) -> Trajectory:
+        """As `rollout`."""
+        if frames < 1:
+            raise ValueError(f"frames is {frames}; take at least 1 (frame 0 is the initial state)")
+        if not 0 < frame_dt < math.inf:
+            raise ValueError(f"frame_dt is {frame_dt} s; take a time above 0")
+        body = self.model
+        coefficients = self.coefficients(parameters)
+        start = self._start(velocity)
+        loads = self._loads()
+        run = _Run(
+            solver=self,
+            system=body.system(coefficients.detach().numpy()),
+            frames=frames,
+            frame_dt=frame_dt,
+            log=log,
+        )
+        q = _Motion.apply(coefficients, start, loads, run)
+        values, slopes = (torch.from_numpy(a) for a in (body.values, body.slopes))
+        u = torch.stack([values @ a for a in q])
+        Ft = torch.stack([(slopes @ a).reshape(-1, 3, 3) for a in q])  # transposed
+        rest = self.position.to(device=device, dtype=torch.float64)
+        place = lambda a: a.to(device=device, dtype=self.world.dtype)
+        one = torch.eye(3, dtype=torch.float64)
+        return Trajectory(
+            rest_position=place(rest),
+            position=place(rest + u.to(device)),
+            deformation=place(Ft.mT + one),
+            fps=1.0 / frame_dt,
+            health=run.health,
+            substeps=max(run.counts, default=0),
+            substep_dt=min((frame_dt / count for count in run.counts), default=frame_dt),
+        )
+
+    def _start(self, velocity: Tensor | None) -> Float[Tensor, "r 3"]:
+        """Amplitudes of the initial velocity."""
+        body, p = self.model, len(self.position)
+        if velocity is None:
+            return torch.zeros(body.count, 3, dtype=torch.float64)
+        require_finite("velocity", velocity)
+        if velocity.shape not in ((3,), (p, 3)):
+            raise ValueError(f"velocity has shape {tuple(velocity.shape)}; take [3] or [{p}, 3]")
+        v = velocity.cpu().double().expand(p, 3)
+        free = v[torch.from_numpy(~body.conditions.held)]
+        return (torch.from_numpy(body.projection) @ free.reshape(-1)).reshape(body.count, 3)
+
+    def _loads(self) -> Float[Tensor, "b r 3"]:
+        """Force on every function: gravity, then each load at its full strength [N]."""
+        body = self.model
+        gravity = torch.tensor(self.world.gravity, dtype=torch.float64)
+        found = [torch.from_numpy(body.first_moment)[:, None] * gravity]
+        for field_, load in zip(body.load_fields, body.conditions.loads, strict=True):
+            found.append(torch.from_numpy(field_)[:, None] * load.acceleration.double())
+        return torch.stack(found)
+
+
+@dataclass
+class _Run:
+    """The loop over frames; `_Motion` is its face to torch."""
+
+    solver: Solver
+    system: System
+    frames: int
+    frame_dt: float
+    log: Log
+    counts: list[int] = field(default_factory=list)
+    health: dict[str, list[float]] = field(default_factory=dict)
+    taken: list[list] = field(default_factory=list)
+
+    def forward(self, v: np.ndarray, loads: np.ndarray, keep: bool) -> np.ndarray:
+        """Amplitudes [t, r, 3] of every frame."""
+        q = np.zeros_like(v)
+        found = [q]
+        self._look(q, v, 0)
+        count = self._count(v, loads)
+        for frame in range(1, self.frames):
+            q, v, count = self._frame(frame, q, v, loads, count, keep)
+            found.append(q)
+            self._look(q, v, frame)
+        return np.stack(found)
+
+    def backward(self, q_bar: np.ndarray, loads: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Adjoints of the coefficients [k, n], the start [r, 3] and the loads, from those of the frames."""
+        points = self.system.points
+        adjoint = {
+            "q": np.zeros_like(q_bar[0]),
+            "v": np.zeros_like(q_bar[0]),
+            "H_0": np.zeros_like(points.data["H_0"]),
+            "memory": np.zeros_like(points.data["memory"]),
+            "coefficients": np.zeros_like(points.data["coefficients"]),
+            "loads": np.zeros_like(loads),
+        }
+        for frame in range(self.frames - 1, 0, -1):
+            adjoint["q"] = adjoint["q"] + q_bar[frame]
+            self.system.pull(self.taken[frame - 1], adjoint, loads)
+        return adjoint["coefficients"], adjoint["v"], adjoint["loads"]
+
+    def _frame(self, frame, q, v, loads, count, keep):
+        world = self.solver.world
+        for tried in range(1, TRIES + 1):
+            taken: list | None = [] if keep else None
+            try:
+                q_new, v_new = self.system.run(q, v, loads, self._plan(frame, count), taken)
+                break
+            except NotSolved as reason:
+                if tried == TRIES or 2 * count > world.max_substeps or world.dt is not None:
+                    raise ValueError(
+                        f"frame {frame}: {reason} with steps of {self.frame_dt / count:g} s; take a weaker force, a "
+                        "slower start, a smaller world.dt or world.solver='grid'"
+                    ) from None
+                count *= 2
+        self.counts.append(count)
+        self.taken.append(taken or [])
+        return q_new, v_new, count
+
+    def _plan(self, frame: int, count: int) -> list[Step]:
+        dt = self.frame_dt / count
+        loads = self.solver.model.conditions.loads
+        plan = []
+        for k in range(count):
+            t = (frame - 1) * self.frame_dt + k * dt
+            plan.append(Step(time=t, dt=dt, signals=(1.0, *(load.boundary.signals(t, dt)[0] for load in loads))))
+        return plan
+
+    def _count(self, v: np.ndarray, loads: np.ndarray) -> int:
+        """Steps in a frame."""
+        world, body = self.solver.world, self.solver.model
+        if world.dt is not None:
+            return math.ceil(self.frame_dt / world.dt * (1 - 1e-9))
+        omega = np.maximum(body.omega, 1e-9)
+        # energies that the modes would have: of a static response, and of the start
+        energy = np.zeros(len(omega))
+        for load in loads:
+            energy = np.maximum(energy, _share(np.einsum("mrk,rk->m", body.shapes, load) ** 2 / omega**2, omega))
+        energy = np.maximum(energy, _share(np.einsum("mrk,rk->m", body.shapes, body.mass @ v) ** 2, omega))
+        matters = energy > SHARE
+        if not matters.any():
+            return 1
+        fastest = float(omega[matters].max())
+        return max(1, math.ceil(self.frame_dt * fastest / (2 * math.pi) * STEPS))
+
+    def _look(self, q: np.ndarray, v: np.ndarray, frame: int) -> None:
+        """Health of a frame, by the names of the solver with a grid."""
+        world, body, points = self.solver.world, self.solver.model, self.system.points
+        H = (body.gradient @ q).reshape(-1, 3, 3)
+        F = H + np.eye(3)
+        J = np.linalg.det(F)
+        stretch = np.sqrt(np.linalg.eigvalsh(F @ F.transpose(0, 2, 1)).max(1))
+        speed = np.linalg.norm(body.values @ v, axis=1)
+        kinetic = 0.5 * float(np.vdot(v, body.mass @ v))
+        elastic = points.energy(H) + 0.5 * sum(float(np.vdot(q, s.matrix @ q)) for s in body.springs if s.pull is None)
+        potential = -float(body.first_moment @ q @ np.array(world.gravity))
+        momentum = body.first_moment @ v
+        record = {
+            "speed_max": float(speed.max()),
+            "J_min": float(J.min()),
+            "J_max": float(J.max()),
+            "stretch_max": float(stretch.max()),
+            "inverted": float((J <= 0).sum()),
+            "isolated": 0.0,
+            "kinetic_energy": kinetic,
+            "elastic_energy": elastic,
+            "potential_energy": potential,
+            "energy": kinetic + elastic + potential,
+            "momentum_x": float(momentum[0]),
+            "momentum_y": float(momentum[1]),
+            "momentum_z": float(momentum[2]),
+            "substeps": float(self.counts[-1] if self.counts else 0),
+            "newton_iterations": float(self.system.iterations),
+            "matrices": float(self.system.matrices),
+        }
+        self.system.iterations = self.system.matrices = 0
+        for name, value in record.items():
+            self.health.setdefault(name, []).append(value)
+
+
+class _Motion(torch.autograd.Function):
+    """(coefficients [k, n], velocity [r, 3], loads [b, r, 3]) -> amplitudes [t, r, 3]."""
+
+    @staticmethod
+    def forward(ctx, coefficients, velocity, loads, run: _Run):
+        ctx.run, ctx.loads = run, loads.detach().numpy()
+        keep = any(ctx.needs_input_grad)
+        return torch.from_numpy(run.forward(velocity.detach().numpy(), ctx.loads, keep))
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, q_bar):
+        found = ctx.run.backward(q_bar.contiguous().numpy(), ctx.loads)
+        return (*(torch.from_numpy(a) for a in found), None)
+
+
+def _share(energy: np.ndarray, omega: np.ndarray) -> np.ndarray:
+    """Of all, rigid motions left out."""
+    energy = np.where(omega > 1e-3 * omega.max(), energy, 0.0)
+    return energy / max(float(energy.sum()), 1e-300)
+
+
+def _check_body(position: Tensor, volume: Tensor) -> None:
+    n = len(position)
+    if n == 0 or position.shape != (n, 3):
+        raise ValueError(f"position has shape {tuple(position.shape)}; take [p, 3] with at least one particle")
+    if volume.shape != (n,):
+        raise ValueError(f"volume has shape {tuple(volume.shape)}; take one per particle, [{n}]")
+    require_finite("position", position)
+    require_finite("volume", volume)
+    if not bool((volume > 0).all()):
+        raise ValueError(
+            f"volume of {int((volume <= 0).sum())} of {n} particles is not above 0 m^3; drop those particles"
+        )
+    if position.requires_grad:
+        raise ValueError("position requires a gradient, which the solver without a grid has not; take solver='grid'")

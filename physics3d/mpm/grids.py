@@ -1,0 +1,65 @@
+"""Grids are cleared, and those of all threads summed into the first, over a range of nodes for each thread."""
+
+from functools import cache
+
+import warp as wp
+
+from physics3d.warp_types import vector, vector4
+
+
+@cache
+def clear(dtype) -> wp.Kernel:
+    """Kernel: set a range of an array to zero."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def clear_kernel(
+        # in
+        first: int,  # node of thread 0
+        # out
+        values: wp.array(dtype=dtype),  # [node]
+    ):
+        values[wp.tid() + first] = dtype()
+
+    return clear_kernel
+
+
+@cache
+def total(dtype) -> wp.Kernel:
+    """Kernel: sum over the rows of grids [threads, node] into the first row, in a fixed order."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def total_kernel(
+        # in
+        first: int,  # node of thread 0
+        # out
+        grids: wp.array2d(dtype=dtype),  # [threads, node] read, and the first row written
+    ):
+        i = wp.tid() + first
+        s = grids[0, i]
+        for t in range(1, grids.shape[0]):
+            s = s + grids[t, i]
+        grids[0, i] = s
+
+    return total_kernel
+
+
+@cache
+def total_of_fours(real) -> wp.Kernel:
+    """Kernel: the first three numbers of the sum over the rows of grids [threads, node], in a fixed order."""
+    vec3, vec4 = vector(real), vector4(real)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def total_of_fours_kernel(
+        # in
+        first: int,  # node of thread 0
+        grids: wp.array2d(dtype=vec4),  # [threads, node]
+        # out
+        values: wp.array(dtype=vec3),  # [node]
+    ):
+        i = wp.tid() + first
+        s = grids[0, i]
+        for t in range(1, grids.shape[0]):
+            s = s + grids[t, i]
+        values[i] = vec3(s[0], s[1], s[2])
+
+    return total_of_fours_kernel

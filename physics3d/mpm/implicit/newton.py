@@ -1,0 +1,130 @@
+"""Newton's method for an implicit step.
+
+The linear systems P^T (M + K) P d = -P^T r are solved without assembling K; C is taken symmetric, and a direction of
+negative curvature ends the solve. The line search asks for the slope of the energy, r(v + a d) . d, which needs no
+energy. Where P is a projector Newton runs in its range, the active set taken anew in each iteration. Where it is none
+(sliding with friction) the system is not symmetric, and BiCGStab takes over. Convergence is judged by the residual
+alone.
+
+Sources: Gast et al. (2015) Optimization integrator for large time steps; Nocedal and Wright (2006) ch. 7.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from physics3d.mpm.implicit.constraints import Constraints
+from physics3d.mpm.implicit.krylov import bicgstab, conjugate_gradients
+from physics3d.mpm.implicit.system import System, dot
+from physics3d.mpm.implicit.tangent import Tangent
+
+ITERATIONS = 30
+TRIES = 10  # of one line search
+
+
+class NotConverged(Exception):
+    """The step is too long for Newton; the message says how it failed."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """What came of one step."""
+
+    node_velocity: Tensor  # [node, 3] m/s: the solution, from which the next state can be made again
+    newton: int  # iterations
+    products: int  # with K, in all linear solves
+
+
+def solve(system: System, *, bounded: bool) -> Step:
+    """Node velocities at the end of the step, and the state that they make. Raises NotConverged.
+
+    `bounded`: a boundary acts on the nodes."""
+    free = system.update(gravity=True)
+    v = system.bounded(system.present * system.momentum / system.safe_mass)  # as if nothing happened
+    if not system.forces(v):
+        raise NotConverged("particles left the grid, or their motion would fold them in one step")
+    tangent = Tangent(system, symmetric=True)
+    if not system.mirrored:
+        blocks = torch.linalg.inv(tangent.inverse_blocks).diagonal(dim1=1, dim2=2).mean(1)[:, None]
+        system.reach = torch.where(system.present > 0, system.mass / blocks, 1.0)
+    tolerance = 1e-4 if v.dtype == torch.float32 else 1e-11
+    newton = products = 0
+    before, residual = math.inf, system.residual(v)
+    size = system.norm(residual)
+    while True:
+        # a body that falls from rest has no spread and, so far, no speed
+        rounding = system.noise(v, tangent.norm) + system.rounding * system.norm(free)
+        goal = tolerance * (system.spread(free) + system.spread(v)) + rounding
+        # within thirty of it, a residual that has stopped falling is rounding too
+        if size <= goal or 0.5 * before <= size <= 30 * goal:
+            return Step(v, newton, products)
+        if newton == ITERATIONS:
+            raise NotConverged(f"Newton has not converged in {ITERATIONS} iterations")
+        if newton:
+            tangent = Tangent(system, symmetric=True)
+        constraints = Constraints(system, bounded=bounded)
+        newton += 1
+        forcing = max(min(0.1, 0.5 * (size / before) ** 1.6), 0.3 * goal / size)
+        d, used = _direction(system, tangent, constraints, residual, forcing * size)
+        products += used
+        slope = dot(system.mass * residual, d)
+        a = 1.0
+        for _ in range(TRIES):
+            trial = v + a * d
+            trial_size, trial_slope = math.inf, math.inf
+            if system.forces(trial):
+                trial_residual = system.residual(trial)
+                trial_size, trial_slope = system.norm(trial_residual), dot(system.mass * trial_residual, d)
+            downhill = constraints.projectors and slope < 0 and trial_slope <= -0.5 * slope
+            if math.isfinite(trial_size) and (trial_size <= 0.9 * size or downhill):
+                v, residual, before, size = trial, trial_residual, size, trial_size
+                break
+            secant = slope / (slope - trial_slope) if slope < 0 < trial_slope < math.inf else 0.5
+            a *= min(max(secant, 0.1), 0.5)
+        else:
+            if size <= 30 * goal:
+                system.forces(v)
+                return Step(v, newton, products)
+            raise NotConverged(f"the line search of Newton iteration {newton} found no way down")
+
+
+def _direction(
+    system: System, tangent: Tangent, constraints: Constraints, residual: Tensor, target: float
+) -> tuple[Tensor, int]:
+    """d of one Newton step, with a residual up to `target` [kg^1/2 m/s]; and the count of products with K.
+
+    Inside the range of P, P^T (M + K) d = -P^T r; outside, d restores the constraints."""
+    s = system.reach
+    if not constraints.projectors:
+        return bicgstab(
+            lambda x: (x - constraints.derivative(x - s * (x + system.inverse_mass * tangent.stiff(x)))) / s,
+            -residual,
+            precondition=lambda x: s * x + constraints.derivative(tangent.block(system.mass * x) - s * x),
+            size=system.norm,
+            target=target,
+        )
+    inside = constraints.derivative(residual)
+    outside = s * (residual - inside)
+    rhs = -system.mass * inside
+    extra = int(bool(outside.any()))
+    if extra:
+        rhs = rhs + constraints.derivative(tangent.stiff(outside), transposed=True)
+    d, used, _ = projected_gradients(system, tangent, constraints, rhs, target)
+    return d - outside, used + extra
+
+
+def projected_gradients(
+    system: System, tangent: Tangent, constraints: Constraints, rhs: Tensor, target: float
+) -> tuple[Tensor, int, bool]:
+    """x = P x with P^T (M + K) x = rhs = P^T rhs; products with K; is the residual at most `target` [kg^1/2 m/s]?
+
+    Preconditioned by P D^-1 P^T, D the diagonal blocks of M + K."""
+    return conjugate_gradients(
+        lambda p: constraints.derivative(system.mass * p + tangent.stiff(p), transposed=True),
+        rhs,
+        precondition=lambda r: constraints.derivative(tangent.block(constraints.derivative(r, transposed=True))),
+        size=lambda r: math.sqrt(dot(r, system.inverse_mass * r)),
+        target=target,
+    )

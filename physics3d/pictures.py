@@ -1,0 +1,44 @@
+"""Pictures that a person looks at: colours as bytes, pictures side by side, a video as one picture."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+from torch import Tensor
+
+
+def to_uint8(image: Tensor) -> Tensor:
+    """Float colour in 0..1 -> uint8, rounding to nearest."""
+    return (image.detach().clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu()
+
+
+def contact_sheet(frames: UInt8[Tensor, "t h w 3"], *, columns: int = 6, count: int = 12) -> UInt8[Tensor, "H W 3"]:
+    """`count` frames evenly spaced in time, laid out in a grid: a video one can look at as a picture."""
+    count = min(count, len(frames))
+    columns = min(columns, count)
+    picks = frames[torch.linspace(0, len(frames) - 1, count).round().long()]
+    rows = -(-count // columns)
+    t, h, w, _ = picks.shape
+    sheet = torch.full((rows * columns, h, w, 3), 255, dtype=torch.uint8)
+    sheet[:t] = picks
+    return sheet.reshape(rows, columns, h, w, 3).permute(0, 2, 1, 3, 4).reshape(rows * h, columns * w, 3)
+
+
+def space_time_slice(frames: UInt8[Tensor, "t h w 3"], *, row: int | None = None, column: int | None = None) -> Tensor:
+    """One line of pixels over time: uint8 [h, t, 3] for a column, [t, w, 3] for a row. Shows motion as a curve."""
+    if (row is None) == (column is None):
+        raise ValueError("space_time_slice needs exactly one of row and column")
+    return frames[:, row] if row is not None else frames[:, :, column].transpose(0, 1)
+
+
+def tiled(images: Sequence[UInt8[np.ndarray, "h w 3"]], columns: int = 4) -> UInt8[np.ndarray, "H W 3"]:
+    """Pictures in rows, each in the corner of a white cell as large as the largest."""
+    height, width = (max(i.shape[k] for i in images) + 4 for k in (0, 1))
+    columns = min(columns, len(images))
+    rows = -(-len(images) // columns)
+    sheet = np.full((rows * height, columns * width, 3), 255, np.uint8)
+    for k, image in enumerate(images):
+        v, u = k // columns * height, k % columns * width
+        sheet[v : v + image.shape[0], u : u + image.shape[1]] = image
+    return sheet

@@ -1,0 +1,155 @@
+"""MLflow's record: made whole by whoever is first, right after a move, without runs that pretend to go on."""
+
+import os
+import shutil
+import signal
+import socket
+import sqlite3
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from pipeline.tracking import EXPERIMENT, Tracking, _free, _process, address, mend
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+OPEN = """
+import sys
+from pathlib import Path
+from pipeline.tracking import Tracking
+made = Tracking(Path(sys.argv[1]), config={"a": 1}, name=sys.argv[2], tags={})
+made.close(scores={}, status="FINISHED")
+sys.exit(made.broken)
+"""
+
+
+def opened(folder: Path, name: str) -> subprocess.Popen:
+    return subprocess.Popen(
+        [sys.executable, "-c", OPEN, str(folder), name], cwd=ROOT, stdout=subprocess.PIPE, text=True
+    )
+
+
+def rows(folder: Path, query: str) -> list[tuple]:
+    with sqlite3.connect(folder / "mlflow.db") as record:
+        return record.execute(query).fetchall()
+
+
+def test_a_kill_while_the_tables_are_made_then_two_first_runs_at_once(tmp_path):
+    killed = opened(tmp_path, "killed")
+    unfinished = tmp_path / "mlflow.db.unfinished"
+    while not (unfinished.exists() and unfinished.stat().st_size):
+        assert killed.poll() is None and not (tmp_path / "mlflow.db").exists()
+        time.sleep(0.005)
+    killed.send_signal(signal.SIGKILL)
+    killed.wait()
+    assert not (tmp_path / "mlflow.db").exists()
+    both = [opened(tmp_path, name) for name in ("one", "two")]
+    said = [process.communicate()[0] for process in both]
+    assert [process.returncode for process in both] == [0, 0], said
+    assert sorted(rows(tmp_path, "select name, status from runs")) == [("one", "FINISHED"), ("two", "FINISHED")]
+    assert len(rows(tmp_path, "select * from experiments where artifact_location like '%/mlartifacts'")) == 1
+    assert [p.name for p in tmp_path.glob("mlflow.db*")] == ["mlflow.db"]
+
+
+# a name with everything that means something to a shell, a URL or a pattern, but for what MLflow cannot address
+@pytest.mark.parametrize("name", ["moved", "it's moved & (re) named; $1, [a] = ü@b:c"])
+def test_a_record_goes_on_working_where_its_folder_is_moved(folder, tmp_path_factory, name):
+    from mlflow.tracking import MlflowClient
+
+    first = Tracking(folder, config={}, name="first", tags={})
+    (folder / "note.txt").write_text("kept")
+    first.client.log_artifact(first.run, str(folder / "note.txt"))
+    first.close(scores={}, status="FINISHED")
+    moved = tmp_path_factory.mktemp("elsewhere") / name
+    shutil.move(folder, moved)
+    mend(moved)
+    second = Tracking(moved, config={}, name="second", tags={})
+    second.client.log_artifact(second.run, str(moved / "note.txt"))
+    assert not second.broken and not folder.exists()
+    client = MlflowClient(f"sqlite:///{moved / 'mlflow.db'}")
+    for run in (first.run, second.run):
+        assert [file.path for file in client.list_artifacts(run)] == ["note.txt"]
+        assert Path(client.download_artifacts(run, "note.txt")).read_text() == "kept"
+    assert rows(moved, "select artifact_location from experiments where artifact_location like '%mlart%'") == [
+        ((moved / "mlartifacts").as_uri(),)
+    ]
+
+
+def test_an_output_folder_that_mlflow_cannot_address_is_said(tmp_path, capsys):
+    odd = tmp_path / "what?"
+    odd.mkdir()
+    assert Tracking(odd, config={}, name="x", tags={}).broken
+    assert "output=<another folder>" in capsys.readouterr().out
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["what?"]
+
+
+def test_runs_whose_processes_are_gone_are_closed_and_no_others(folder):
+    Tracking(folder, config={}, name="x", tags={})
+    (experiment,) = rows(folder, f"select experiment_id from experiments where name = '{EXPERIMENT}'")[0]
+    ended = subprocess.Popen(["true"])  # not waited for: a zombie
+    me = _process(os.getpid())
+    host, pid, start = me.split()
+    processes = {
+        "alive": me,
+        "elsewhere": f"another-{host} {pid} {int(start) + 1}",
+        "no process of ours": "something else",
+        "number used again": f"{host} {pid} {int(start) + 1}",
+        "never was": f"{host} 999999999 1",
+    }
+    while "ended" not in _process(ended.pid):
+        time.sleep(0.01)
+    processes["ended"] = f"{host} {ended.pid} {start}"
+    with sqlite3.connect(folder / "mlflow.db") as record:
+        for name, process in processes.items():
+            values = (name, experiment, name)
+            record.execute(
+                "insert into runs (run_uuid, experiment_id, name, status) values (?, ?, ?, 'RUNNING')", values
+            )
+            record.execute("insert into tags (run_uuid, key, value) values (?, 'process', ?)", (name, process))
+    mend(folder)
+    states = dict(rows(folder, "select name, status from runs"))
+    assert {name for name in processes if states[name] == "KILLED"} == {"number used again", "never was", "ended"}
+    assert states["x"] == "RUNNING"
+    ended.wait()
+
+
+@pytest.mark.parametrize("content", [b"", b"this is no database", None], ids=["empty", "text", "folder"])
+def test_what_is_no_record_is_set_aside_with_a_word(tmp_path, content, capsys):
+    file = tmp_path / "mlflow.db"
+    file.mkdir() if content is None else file.write_bytes(content)
+    mend(tmp_path)
+    (aside,) = tmp_path.glob("mlflow.db.damaged-*")
+    assert not file.exists() and str(aside) in capsys.readouterr().out
+    assert content is None or aside.read_bytes() == content
+
+
+def test_a_record_in_use_is_left_in_its_place(folder, capsys, monkeypatch):
+    with sqlite3.connect(folder / "mlflow.db") as busy:
+        busy.execute("begin exclusive")
+        plain = sqlite3.connect
+        monkeypatch.setattr(sqlite3, "connect", lambda *given, **named: plain(*given, **named, timeout=0.1))
+        mend(folder)
+    assert "database is locked" in capsys.readouterr().out and (folder / "mlflow.db").exists()
+
+
+@pytest.mark.parametrize("port", ["abc", "", "0", "70000", "-1", "5000; true", "80.5", "٣"])
+def test_what_is_no_port_is_refused(port):
+    with pytest.raises(ValueError, match=r"is no port; make ui PORT="):
+        _free(port)
+
+
+def test_a_port_that_is_taken_is_one_line(folder):
+    Tracking(folder, config={}, name="x", tags={})
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        env = {**os.environ, "PORT": str(port)}
+        call = [sys.executable, "-m", "pipeline.tracking", str(folder)]
+        done = subprocess.run(call, env=env, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 1 and not done.stdout
+    (line,) = done.stderr.splitlines()
+    assert line.startswith(f"error: port {port} cannot be served") and "make ui PORT=" in line
+    assert _free(str(port)) == port and str(port) in address(folder, port)
