@@ -94,6 +94,8 @@ class Learn:
             raise ValueError(
                 f"capture {capture.name} has no take with role learn; leave out the learning, or record a motion"
             )
+        if take.excitation is None:
+            raise ValueError(f"take {take.name}: nobody knows what set it in motion, and a start is not learned yet")
         start = self.world.estimate()
         look_ahead(body, self.world, take.excitation, log)
         indices = self.spread(take.footage)

@@ -34,7 +34,11 @@ class Outline:
 
 @dataclass(frozen=True, kw_only=True)
 class Take:
-    """One recorded motion, seen by one or more fixed cameras at the same instants; frame 0 is the rest state."""
+    """One recorded motion, seen by one or more fixed cameras at the same instants.
+
+    Frame 0 is the rest state where the excitation is known. Where it is not, nobody knows the state at any frame: from
+    frame `release` on the motion is free, and its start is to be found.
+    """
 
     name: str
     role: str  # "learn" or "evaluate"
@@ -43,7 +47,9 @@ class Take:
     videos: tuple[
         Tensor, ...
     ]  # uint8 [t, h, w, 3], one per camera, composited on Capture.background where there is a matte
-    excitation: tuple[AbstractBoundary, ...] = ()  # what set it in motion (a poke); gravity and floors are in the World
+    excitation: tuple[AbstractBoundary, ...] | None = ()  # what set it in motion (a poke); None: unknown. Gravity and
+    # floors are in the World
+    release: int = 0  # first frame from which nothing but the World acts, where the excitation is unknown
     held_out_cameras: tuple[int, ...] = ()  # cameras used by evaluation only, although the take is learned from
 
     @property
@@ -98,6 +104,8 @@ class Capture(AbstractArtifact):
                 raise ValueError(
                     f"take {take.name}: role {take.role!r} must be learn or evaluate, with one video per camera"
                 )
+            if not all(0 <= take.release < len(video) for video in take.videos):
+                raise ValueError(f"take {take.name}: release is {take.release}, not one of its frames")
 
     @property
     def outline(self) -> Outline:
