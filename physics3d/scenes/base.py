@@ -50,6 +50,10 @@ class Take:
     excitation: tuple[AbstractBoundary, ...] | None = ()  # what set it in motion (a poke); None: unknown. Gravity and
     # floors are in the World
     release: int = 0  # first frame from which nothing but the World acts, where the excitation is unknown
+    seen: int | None = None  # so many first frames are learned from where the excitation is unknown; None: half of them
+    # frame in which the thing is where its Gaussians are, where the excitation is unknown; None: that of the first take
+    posed: int | None = None
+    at_rest: bool = False  # whether it is at rest there
     held_out_cameras: tuple[int, ...] = ()  # cameras used by evaluation only, although the take is learned from
 
     @property
@@ -71,6 +75,7 @@ class Capture(AbstractArtifact):
     takes: tuple[Take, ...] = ()
     gaussians: Gaussians | None = None  # a trained model, if the capture is one: reconstruction is then left out
     single_object: bool = False  # one object on a plain background: segmentation is then left out
+    moves: Tensor | None = None  # bool, one per Gaussian, where the source knows what moves: likewise left out
     truth: dict[str, float] = field(default_factory=dict)  # material parameters, SI, named as in the material
     truth_source: str = ""  # where `truth` comes from, and how far to trust it
     floor: float | None = None  # height of the ground that things stand on [m]; None: none is known
@@ -97,6 +102,8 @@ class Capture(AbstractArtifact):
             raise ValueError(f"capture {self.name}: all {n} images are held out; leave some to train on")
         if self.points is not None:
             require_finite(f"capture {self.name}: points", self.points)
+        if self.moves is not None and (self.gaussians is None or len(self.moves) != len(self.gaussians)):
+            raise ValueError(f"capture {self.name}: moves needs one value for each of its Gaussians")
         if self.floor is not None and not math.isfinite(self.floor):
             raise ValueError(f"capture {self.name}: floor is {self.floor}; give its height in metres, or None")
         for take in self.takes:

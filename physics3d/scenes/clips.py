@@ -52,12 +52,12 @@ class FilmedTake:
         )
 
 
-def clip_files(path: Path) -> list[Path]:
-    """The clip itself, or the clips of a folder in the order of their names. Raises ValueError if there is none."""
+def clip_files(path: Path, pattern: str = "*") -> list[Path]:
+    """The clip itself, or the clips of a folder whose names fit, in their order. Raises ValueError if there is none."""
     if path.is_dir():
-        found = sorted(p for p in path.iterdir() if p.suffix.lower() in VIDEOS)
+        found = sorted(p for p in path.glob(pattern) if p.suffix.lower() in VIDEOS and not p.name.startswith("."))
         if not found:
-            raise ValueError(f"{path} holds no clip ({', '.join(VIDEOS)}); put one there")
+            raise ValueError(f"{path} holds no clip {pattern} ({', '.join(VIDEOS)}); put one there")
         return found
     if not path.is_file():
         raise ValueError(f"no clip at {path}; check the path")
@@ -68,6 +68,7 @@ def filmed_takes(
     path: Path,
     *,
     log,
+    pattern: str = "*",
     fps: float | None = None,
     longest_side: int = SIDE,
     box: tuple[float, float, float, float] | None = None,
@@ -78,7 +79,7 @@ def filmed_takes(
     `motion/clip.py` and `motion/usable.py`), and RuntimeError where there is no ffmpeg.
     """
     takes = []
-    for number, file in enumerate(clip_files(path)):
+    for number, file in enumerate(clip_files(path, pattern)):
         clip = read_clip(file, fps=fps, longest_side=longest_side)
         for note in clip.notes:
             log.info(f"{file.name}: {note}")
