@@ -4,16 +4,19 @@ PROFILE ?= default
 METHOD ?= physics3d
 DATA ?=
 ARGS ?=
+REAL ?=
+PRED ?=
+OUT ?=
 PORT ?= 5000
 PYTHON ?= python3
 # these may hold anything, quotes, semicolons and dollar signs too: they are taken as they stand, and reach commands by the
 # environment, never as a part of a line that a shell or make reads
-$(foreach name,SCENE PROFILE METHOD DATA ARGS PORT PYTHON,$(eval override $(name) := $$(value $(name))))
-export SCENE PROFILE METHOD DATA ARGS PORT PYTHON
+$(foreach name,SCENE PROFILE METHOD DATA ARGS PORT PYTHON REAL PRED OUT,$(eval override $(name) := $$(value $(name))))
+export SCENE PROFILE METHOD DATA ARGS PORT PYTHON REAL PRED OUT
 
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup run ui view test newest bench lint architecture clean
+.PHONY: help setup run score twin ui view test newest bench lint architecture clean
 py := .venv/bin/python
 # torch's own threads spin beside those of the renderer and the simulator: OMP_NUM_THREADS=1 unless you say otherwise
 threads := OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1}
@@ -45,6 +48,12 @@ $(ready): pyproject.toml constraints.txt
 run: $(ready) ## the pipeline on SCENE; what has been computed before is reused
 	@$(threads) $(with_args) -m pipeline scene="$$SCENE" profile="$$PROFILE" method="$$METHOD" $${DATA:+data="$$DATA"}
 
+score: $(ready) ## any two videos compared: REAL=<clip> PRED=<clip> [OUT=<folder>]
+	@$(threads) $(py) -m pipeline.score
+
+twin: $(ready) ## a thing with known material as photographs and clips on disk: OUT=<new folder>
+	@$(threads) $(py) -m pipeline.twin
+
 ui: $(ready) ## MLflow: prints the address of the page that compares runs, and serves it
 	@$(py) -m pipeline.tracking .
 
@@ -64,7 +73,7 @@ newest: ## the tests with the newest version of everything, in an environment of
 	@$(quietly) .venv-newest/bin/python -m pip install --quiet --upgrade --upgrade-strategy eager --no-build-isolation -e '.[dev,sfm]'
 	@OMP_NUM_THREADS=1 .venv-newest/bin/python -m pipeline.words -m pytest -n 2 --dist loadfile
 
-bench: $(ready) bench-speed bench-renderer bench-filling bench-embedding bench-simulation bench-swaying bench-stability bench-segmentation bench-reconstruction ## measurements with plots, into docs/results; one alone: make bench-<name>
+bench: $(ready) bench-speed bench-renderer bench-filling bench-embedding bench-simulation bench-swaying bench-stability bench-segmentation bench-reconstruction bench-motion ## measurements with plots, into docs/results; one alone: make bench-<name>
 
 bench-%: export BENCH = $*
 bench-%: $(ready)

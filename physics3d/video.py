@@ -120,3 +120,14 @@ def read_mp4(path: Path) -> tuple[UInt8[Tensor, "t h w 3"], float]:
     except (OSError, RuntimeError, ValueError, StopIteration) as error:
         raise ValueError(f"cannot read the video {path}: {' '.join(str(error).split())[:200]}") from error
     return torch.from_numpy(array), fps
+
+
+def reduced(frames: UInt8[Tensor, "t h w 3"], height: int, width: int) -> UInt8[Tensor, "t height width 3"]:
+    """Frames with fewer pixels, each the mean of what it covers."""
+    if tuple(frames.shape[1:3]) == (height, width):
+        return frames.contiguous()
+    parts = [
+        torch.nn.functional.interpolate(part.permute(0, 3, 1, 2).float(), (height, width), mode="area")
+        for part in frames.split(16)
+    ]
+    return (torch.cat(parts).permute(0, 2, 3, 1) + 0.5).to(torch.uint8).contiguous()

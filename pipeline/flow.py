@@ -1,6 +1,7 @@
 """The pipeline as a graph: which stage takes what, and which stages a scene does not need.
 
     capture -> reconstruct -> segment -> fill -> learn -> simulate -> render -> evaluate
+                                                       -> foretell (where the cause of the recorded motion is unknown)
                                  guess (the configured material) -> learn's start, and what is compared with
 
 `plan` writes the graph down without running anything, so that "is everything up to date?" is answered in a second;
@@ -50,6 +51,8 @@ def plan(config: dict[str, Any], capture: Step, ask: bool = True) -> Plan:
     estimate = guess if "learn" in without else step("learn", capture, gaussians, body)
     trajectory = step("simulate", body, estimate)
     video = step("render", capture, gaussians, body, trajectory)
+    if "foretell" not in without:
+        step("foretell", capture, gaussians, body, estimate)
     if "evaluate" not in without:
         videos, estimates = {"learned": video}, {"learned": estimate}
         if "learn" in without:
@@ -71,10 +74,17 @@ def left_out(config: dict[str, Any], capture: dict[str, Any], shelf: Path) -> di
         why["reconstruct"] = "the scene is a trained model already"
     if capture["single_object"]:
         why["segment"] = "the scene is a single object"
+    elif capture.get("moves") is not None:
+        why["segment"] = "the scene says what moves"
     if "learn" not in roles:
         why.setdefault("learn", "the scene has no recorded motion to learn from")
+    unknown = any(take["role"] == "learn" and take["excitation"] is None for take in capture["takes"])
     if not roles:
         why["evaluate"] = "the scene has no recorded motion to compare with"
+    if unknown:
+        why["evaluate"] = "nobody knows what set the recorded motion going: it is foretold instead"
+    else:
+        why["foretell"] = "what set the recorded motion going is known" if roles else why["evaluate"]
     for name in why:
         usual = usual_seconds(shelf, name)
         if usual is not None:

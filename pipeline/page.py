@@ -15,8 +15,8 @@ from typing import Any
 from physics3d.checks import Count, Device, Pixels, Seed, Text, complaint
 from pipeline.fields import Class, Declared, Unknown, classes, declared
 
-STAGES = ("capture", "guess", "reconstruct", "segment", "fill", "learn", "simulate", "render", "evaluate")
-MAY_BE_NULL = ("segment", "learn", "evaluate")  # stages that a method may do without
+STAGES = ("capture", "guess", "reconstruct", "segment", "fill", "learn", "simulate", "render", "foretell", "evaluate")
+MAY_BE_NULL = ("segment", "learn", "foretell", "evaluate")  # stages that a method may do without
 PLAIN = {  # entries that belong to no class
     "data": Text,
     "output": Text,
@@ -30,6 +30,7 @@ USED_BY_STAGES = {  # entries that stages take over; those of a class are checke
     "": ("world", "material", "prior", "masker", "densification", "solid", *STAGES),
     "scene": [
         "source",
+        "camera_distance",
         "prompts",
         "density",
         "dx",

@@ -9,13 +9,11 @@ from torch import Tensor
 
 from physics3d.boundaries.base import AbstractBoundary
 from physics3d.log import Log
+from physics3d.metrics.against import Reference
 from physics3d.metrics.comparable import matched, same, shrink
-from physics3d.metrics.image import ms_ssim, psnr, ssim
-from physics3d.metrics.motion import flow, flow_error, motion_psnr, moving, oscillation, signal
 from physics3d.metrics.parameters import parameter_errors
 from physics3d.metrics.previews import previews
 from physics3d.metrics.scores import FROZEN, REFERENCE, Scores
-from physics3d.metrics.video import vmaf
 from physics3d.scenes.base import Capture
 from physics3d.video import Video
 from physics3d.world import Estimate
@@ -78,34 +76,14 @@ class Evaluate:
         self, rows: dict[str, list[Tensor]], fps: float, notes: dict[str, str], log: Log
     ) -> dict[str, dict[str, float | None]]:
         """Every row against the reference: means over cameras."""
-        references = rows[REFERENCE]
-        motions = [flow(clip) for clip in references]
-        where = [moving(u) for u in motions]
+        references = [Reference(clip, fps) for clip in rows[REFERENCE]]
         table: dict[str, dict[str, float | None]] = {}
         for row, clips in log.progress(list(rows.items()), "scoring"):
             per_camera = []
-            for clip, reference, u_ref, mask in zip(clips, references, motions, where):
-                cells: dict[str, tuple[float | None, str]] = {}
-                if row != REFERENCE:
-                    cells["psnr"] = psnr(clip, reference), ""
-                    cells["ssim"] = ssim(clip, reference), ""
-                    cells["ms_ssim"] = ms_ssim(clip, reference)
-                    cells["vmaf"] = vmaf(clip, reference)
-                    cells["motion_psnr"] = motion_psnr(clip, reference)
-                if mask is None:
-                    why = "the reference moves by less than half a pixel"
-                    cells |= {name: (None, why) for name in ("flow_error", "frequency", "damping")}
-                else:
-                    u = flow(clip)
-                    if row != REFERENCE:
-                        cells["flow_error"] = flow_error(u, u_ref, mask), ""
-                    found, why = oscillation(signal(u, u_ref, mask), fps)
-                    cells["frequency"], cells["damping"] = (
-                        (found and found.frequency, ""),  # type: ignore[assignment]
-                        (found and found.damping, ""),  # type: ignore[assignment]
-                    )
-                    if why:
-                        notes.setdefault(f"oscillation of {row}", why)
+            for clip, reference in zip(clips, references):
+                cells, why = reference.itself() if row == REFERENCE else reference.measure(clip)
+                if why:
+                    notes.setdefault(f"oscillation of {row}", why)
                 per_camera.append(cells)
             table[row] = {}
             for name in per_camera[0]:

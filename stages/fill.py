@@ -36,7 +36,9 @@ class Fill:
     def __call__(self, capture: Capture, gaussians: Gaussians, segmentation: Segmentation | None, *, log: Log) -> Body:
         """Without a segmentation everything visible moves. Raises ValueError if nothing does."""
         self.check()
-        if segmentation is None:
+        if segmentation is None and capture.moves is not None:
+            label = capture.moves.to(torch.int32)
+        elif segmentation is None:
             label = (gaussians.opacity > VISIBLE).to(torch.int32)
         elif len(segmentation.label) != len(gaussians):
             raise ValueError(
@@ -55,6 +57,7 @@ class Fill:
             isolated=self.isolated,
             drop_pieces_below=self.drop_pieces_below,
             attach=self.attach == "auto",
+            sure=capture.moves is not None,
             cameras=capture.cameras,
             log=log,
         )

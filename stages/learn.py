@@ -34,6 +34,7 @@ from physics3d.learning.linear import sensitivity
 from physics3d.learning.loss import Chain
 from physics3d.learning.polish import polish
 from physics3d.learning.search import search
+from physics3d.learning.unknown_cause import learned_free
 from physics3d.log import Log
 from physics3d.pictures import contact_sheet, to_uint8
 from physics3d.priors.base import AbstractPrior
@@ -68,6 +69,7 @@ class Learn:
     stay: NotNegative = 0.01  # pull to the start: cost of a factor e, in units of half the loss at the start
     span: Span = 100.0  # a parameter stays within start/span .. start*span
     largest_gradient: Positive = 3.0  # clip of the global norm, in units of the loss at the start per unit of theta
+    zones: Annotated[int, Ge(1), Le(16)] = 4  # of stiffness, where the cause of the motion is unknown
     device: Device = "cpu"
     seed: Seed = 0
 
@@ -94,6 +96,8 @@ class Learn:
             raise ValueError(
                 f"capture {capture.name} has no take with role learn; leave out the learning, or record a motion"
             )
+        if take.excitation is None:
+            return learned_free(self.world, capture, gaussians, body, zones=self.zones, log=log)
         start = self.world.estimate()
         look_ahead(body, self.world, take.excitation, log)
         indices = self.spread(take.footage)

@@ -30,6 +30,7 @@ ROOMS = {
     "physics3d.mpm": ("physics3d.world", "physics3d.materials", "physics3d.boundaries"),
     "physics3d.modes": ("physics3d.world", "physics3d.materials", "physics3d.boundaries"),
     "physics3d.priors": (),
+    "physics3d.motion": (),
 }
 ORCHESTRATION = ("prefect", "mlflow", "hydra", "omegaconf")
 # sam2 brings its own Hydra configuration files, which are read where its model is built

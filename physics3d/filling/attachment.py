@@ -13,15 +13,19 @@ CONTACT = (0.6, 1.0)  # particles nearer to a static Gaussian are held by it; at
 SPECK = 0.05  # static clusters of less than this share are mistakes of the segmentation and hold nothing
 
 
-def attached_particles(position: np.ndarray, spacing: float, static: Gaussians, log: Log) -> np.ndarray:
-    """Bool [p]: particles within CONTACT spacings of static Gaussians that are part of more than a speck.
+def attached_particles(
+    position: np.ndarray, spacing: float, static: Gaussians, log: Log, *, sure: bool = False
+) -> np.ndarray:
+    """Bool [p]: particles within CONTACT spacings of static Gaussians that are part of more than a speck, or of any
+    where it is `sure` that they are static.
 
     A flat contact also holds what lies within its outline: of a stem in its soil only the rim touches what is seen.
     """
     attached = np.zeros(len(position), bool)
     if len(static):
         least, reach = (c * spacing for c in CONTACT)
-        solid = static.select(torch.from_numpy(not_specks(static.mean.double().numpy(), 4 * spacing)))
+        whole = np.ones(len(static), bool) if sure else not_specks(static.mean.double().numpy(), 4 * spacing)
+        solid = static.select(torch.from_numpy(whole))
         point, _ = over_discs(solid, spacing / 2)
         near = ((point > position.min(0) - reach) & (point < position.max(0) + reach)).all(1)
         if near.any():

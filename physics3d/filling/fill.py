@@ -54,6 +54,7 @@ def fill(
     isolated: str,
     drop_pieces_below: float,
     attach: bool,
+    sure: bool = False,
     cameras: Sequence[Camera],
     log: Log,
 ) -> Body:
@@ -117,7 +118,7 @@ def fill(
     volume = np.concatenate([volume[keep], np.full(len(bridge), spacing**3)])
     inner = np.concatenate([inner[keep], np.zeros(len(bridge), bool)])
     part = np.concatenate([part[keep], bridge_part])
-    attached = torch.from_numpy(attached_particles(position, spacing, static, log)) if attach else None
+    attached = torch.from_numpy(attached_particles(position, spacing, static, log, sure=sure)) if attach else None
 
     placed, of = torch.from_numpy(position).to(torch.float32), torch.from_numpy(part).to(torch.int32)
     return Body(

@@ -36,7 +36,7 @@ EDGE = 2.0  # [px] over which the share of an edge falls from 1 to 0: low pass, 
 LIMB = 2.0  # deviations by which the outlines of layers of Gaussians lie outside of their centres
 # deviations by which their near side lies before them: 3 make balls of Gaussians at known depths as large as their
 # pictures, 4 the stem of the reconstructed carnation as thick as it is
-FRONT = 3.5
+FRONT = 3.0
 FAR = 1e6  # depth where nothing is seen [m]
 
 

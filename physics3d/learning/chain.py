@@ -57,7 +57,7 @@ def chain_of(
         world,
         rest,
         volume,
-        excitation=(*body.held, *take.excitation),
+        excitation=(*body.held, *(take.excitation or ())),
         part=part,
         matter=body.matter,
         device=device,

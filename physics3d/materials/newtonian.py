@@ -78,7 +78,7 @@ def _advance(real: type) -> wp.Function:
     carried_volume = volume.carried_volume(real)
     least2 = real(_LEAST_RATE**2)
 
-    cofactor, round_off = volume.cofactor(real), real(5e-7 if real is wp.float32 else 1e-15)
+    cofactor, least_det = volume.cofactor(real), real(1e-5 if real is wp.float32 else 1e-12)
 
     @wp.func(name=f"rate_of_deformation_{real.__name__}")
     def rate(dt: real, L: mat33, M: mat33):
@@ -86,10 +86,8 @@ def _advance(real: type) -> wp.Function:
         if dt > real(0.0):
             X = M + wp.transpose(M) + M * wp.transpose(M)
             B = wp.identity(n=3, dtype=real) + X
-            C = cofactor(B)
-            # finite where the step flattens the body, or stretches it so unequally that rounding takes the determinant
-            least = wp.max(real(1e-12), round_off * wp.sqrt(wp.ddot(B, B)) * wp.sqrt(wp.ddot(C, C)))
-            D = (X + X * (C / wp.max(wp.determinant(B), least))) / (real(4.0) * dt)
+            inverse = cofactor(B) / wp.max(wp.determinant(B), least_det)  # finite where the step flattens the body
+            D = (X + X * inverse) / (real(4.0) * dt)
         return D
 
     @wp.func(name=f"newtonian_{real.__name__}")

@@ -146,7 +146,7 @@ class Viscoelastic(AbstractMaterial):
         return _advance(self.branches, self.elastic, self.spring, self.flow, real)
 
 
-_NEAR = 0.7  # relaxation times: after a longer step the strain is stored as it is, after a shorter one ahead
+_NEAR = 1.0  # relaxation times: after a longer step the strain is stored as it is, after a shorter one ahead
 
 
 def _grown(x: Tensor) -> Tensor:

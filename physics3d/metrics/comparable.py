@@ -3,17 +3,16 @@
 from dataclasses import fields
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from physics3d.boundaries.base import AbstractBoundary
 from physics3d.scenes.base import Take
-from physics3d.video import Video
+from physics3d.video import Video, reduced
 
 
-def same(simulated: tuple[AbstractBoundary, ...], filmed: tuple[AbstractBoundary, ...]) -> bool:
-    """Whether both were set in motion alike, to a thousandth of every number."""
-    if [type(b) for b in simulated] != [type(b) for b in filmed]:
+def same(simulated: tuple[AbstractBoundary, ...], filmed: tuple[AbstractBoundary, ...] | None) -> bool:
+    """Whether both were set in motion alike, to a thousandth of every number; an unknown cause is like no other."""
+    if filmed is None or [type(b) for b in simulated] != [type(b) for b in filmed]:
         return False
     pairs = [(getattr(a, f.name), getattr(b, f.name)) for a, b in zip(simulated, filmed) for f in fields(a)]
     words = (str, type(None))
@@ -51,8 +50,4 @@ def shrink(reference: Tensor, clips: dict[str, list[Tensor]], index: int, count:
             f"videos of {[f'{w} x {h}' for h, w in sizes]} px cannot be compared with a reference of {own[1]} x "
             f"{own[0]} px; render all at one scale <= 1 with the reference's camera"
         )
-    if (h, w) == own:
-        return reference[:count].contiguous()
-    frames = reference[:count].permute(0, 3, 1, 2).float()
-    small = torch.nn.functional.interpolate(frames, (h, w), mode="area").permute(0, 2, 3, 1)
-    return (small + 0.5).to(torch.uint8).contiguous()
+    return reduced(reference[:count], h, w)

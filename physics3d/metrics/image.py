@@ -35,15 +35,21 @@ def psnr(video: UInt8[Tensor, "t h w 3"], reference: UInt8[Tensor, "t h w 3"]) -
     return decibel(total / video.numel() / 255**2)
 
 
+def psnr_per_frame(video: UInt8[Tensor, "t h w 3"], reference: UInt8[Tensor, "t h w 3"]) -> list[float]:
+    """10 log10(1/MSE) [dB] of every frame, at most 100. Raises ValueError for unequal shapes."""
+    check_pair(video, reference)
+    errors = [float(((a.double() - b.double()) ** 2).mean()) / 255**2 for a, b in zip(video, reference)]
+    return [min(100.0, decibel(error)) for error in errors]
+
+
 def decibel(mse: float) -> float:
     return math.inf if mse == 0 else -10 * math.log10(mse)
 
 
 def ssim(video: UInt8[Tensor, "t h w 3"], reference: UInt8[Tensor, "t h w 3"]) -> float:
     """Mean over frames. Raises ValueError for unequal shapes."""
-    from torchmetrics.functional.image import structural_similarity_index_measure as measure
-
-    return frame_mean(video, reference, lambda a, b: measure(a, b, data_range=1.0, reduction="none"))
+    values = ssim_per_frame(video, reference)
+    return sum(values) / len(values)
 
 
 def ms_ssim(video: UInt8[Tensor, "t h w 3"], reference: UInt8[Tensor, "t h w 3"]) -> tuple[float | None, str]:
@@ -57,9 +63,21 @@ def ms_ssim(video: UInt8[Tensor, "t h w 3"], reference: UInt8[Tensor, "t h w 3"]
     return frame_mean(video, reference, lambda a, b: measure(a, b, data_range=1.0, reduction="none")), ""
 
 
-def frame_mean(video, reference, measure) -> float:
+def ssim_per_frame(video: UInt8[Tensor, "t h w 3"], reference: UInt8[Tensor, "t h w 3"]) -> list[float]:
+    """Raises ValueError for unequal shapes."""
+    from torchmetrics.functional.image import structural_similarity_index_measure as measure
+
+    return per_frame(video, reference, lambda a, b: measure(a, b, data_range=1.0, reduction="none"))
+
+
+def per_frame(video, reference, measure) -> list[float]:
     check_pair(video, reference)
-    total = 0.0
+    values: list[float] = []
     for a, b in zip(video.split(CHUNK), reference.split(CHUNK)):
-        total += float(measure(a.permute(0, 3, 1, 2) / 255, b.permute(0, 3, 1, 2) / 255).sum())
-    return total / len(video)
+        values += measure(a.permute(0, 3, 1, 2) / 255, b.permute(0, 3, 1, 2) / 255).reshape(-1).tolist()
+    return values
+
+
+def frame_mean(video, reference, measure) -> float:
+    values = per_frame(video, reference, measure)
+    return sum(values) / len(values)

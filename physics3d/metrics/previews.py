@@ -6,8 +6,9 @@ import torch
 from torch import Tensor
 
 from physics3d.log import Log
+from physics3d.metrics.pictures import busiest, slices
 from physics3d.metrics.scores import FROZEN, REFERENCE, UNITS, Scores, columns
-from physics3d.pictures import contact_sheet, space_time_slice
+from physics3d.pictures import contact_sheet
 from physics3d.video import write_mp4
 
 
@@ -19,28 +20,8 @@ def previews(rows: dict[str, list[Tensor]], fps: float, scores: Scores, log: Log
         suffix = f"_{camera}" if len(rows[REFERENCE]) > 1 else ""
         write_mp4(log.path(f"previews/side_by_side{suffix}.mp4"), torch.cat(clips, 2), fps)
         log.image(f"frames{suffix}", contact_sheet(torch.cat(clips, 1), columns=8, count=8))  # one row per video
-        moved = (rows[REFERENCE][camera].float() - rows[REFERENCE][camera][0].float()).abs().sum((0, 3))
-        row, column = int(moved.sum(1).argmax()), int(moved.sum(0).argmax())
-        log.image(f"slices{suffix}", space_time(shown, clips, row, column))
+        log.image(f"slices{suffix}", slices(shown, clips, *busiest(rows[REFERENCE][camera])))
     log.image("bars", bars(scores))
-
-
-def space_time(names: list[str], clips: list[Tensor], row: int, column: int):
-    """A figure: the row and the column of pixels with most motion in the reference, against time."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(3 * len(names), 5.2), layout="constrained")
-    for i, (name, clip) in enumerate(zip(names, clips)):
-        for k, (picture, what) in enumerate(
-            (
-                (space_time_slice(clip, row=row), f"row {row}: time down"),
-                (space_time_slice(clip, column=column), f"column {column}: time right"),
-            )
-        ):
-            axis = figure.add_subplot(2, len(names), 1 + i + k * len(names))
-            axis.imshow(picture.numpy(), aspect="auto", interpolation="nearest")
-            axis.set(title=f"{name}\n{what}" if k == 0 else what, xticks=[], yticks=[])
-    return figure
 
 
 def bars(scores: Scores):

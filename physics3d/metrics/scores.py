@@ -9,6 +9,7 @@ FROZEN, REFERENCE = "frozen first frame", "reference"  # rows that everyone is c
 UNITS = {
     "psnr": "PSNR [dB]", "ssim": "SSIM", "ms_ssim": "MS-SSIM", "vmaf": "VMAF", "motion_psnr": "motion PSNR [dB]",
     "flow_error": "flow error", "frequency": "frequency [Hz]", "damping": "damping [1/s]",
+    "phase": "phase [deg]",
     "value": "value", "truth": "truth", "error_percent": "error [%]", "log_ratio": "ln(value/truth)",
 }  # fmt: skip
 

@@ -25,15 +25,7 @@ from physics3d.modes.dynamics import TOLERANCE, Spring, System
 from physics3d.modes.stress import Points
 from physics3d.world import World
 
-CELL = (
-    1,
-    1.5,
-    2,
-    3,
-    4,
-    6,
-    8,
-)  # spacing of the splines, in edges of a piece: the first with at most MOST_SPLINES of them
+CELL = (2, 3, 4, 6, 8)  # spacing of the splines, in edges of a piece: the first with at most MOST_SPLINES of them
 MOST_SPLINES = 1500
 PIN = 1e3  # stiffness of a pin, in that of a cube of the piece behind it
 MODES = 12  # of vibration, whose components are fields of the basis
@@ -219,7 +211,7 @@ def model(
     K += np.kron(C.T @ (permanent @ C), np.eye(3))
     mass = C.T @ (scalar_mass @ C)
     lowest, shapes = vibration.dense_modes(K, np.kron(mass, np.eye(3)), len(exact), shift=shift)
-    off = np.abs(np.sqrt(np.maximum(lowest / exact, 0))[swings][:4] - 1)
+    off = np.abs(np.sqrt(np.maximum(lowest[swings] / exact[swings], 0))[:4] - 1)
     log.info(
         f"basis of {C.shape[1]} fields, integrated at {len(which)} points: its first frequencies are within "
         f"{100 * off.max(initial=0):.2g} % of those of the splines"

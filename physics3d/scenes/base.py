@@ -34,7 +34,11 @@ class Outline:
 
 @dataclass(frozen=True, kw_only=True)
 class Take:
-    """One recorded motion, seen by one or more fixed cameras at the same instants; frame 0 is the rest state."""
+    """One recorded motion, seen by one or more fixed cameras at the same instants.
+
+    Frame 0 is the rest state where the excitation is known. Where it is not, nobody knows the state at any frame: from
+    frame `release` on the motion is free, and its start is to be found.
+    """
 
     name: str
     role: str  # "learn" or "evaluate"
@@ -43,7 +47,13 @@ class Take:
     videos: tuple[
         Tensor, ...
     ]  # uint8 [t, h, w, 3], one per camera, composited on Capture.background where there is a matte
-    excitation: tuple[AbstractBoundary, ...] = ()  # what set it in motion (a poke); gravity and floors are in the World
+    excitation: tuple[AbstractBoundary, ...] | None = ()  # what set it in motion (a poke); None: unknown. Gravity and
+    # floors are in the World
+    release: int = 0  # first frame from which nothing but the World acts, where the excitation is unknown
+    seen: int | None = None  # so many first frames are learned from where the excitation is unknown; None: half of them
+    # frame in which the thing is where its Gaussians are, where the excitation is unknown; None: that of the first take
+    posed: int | None = None
+    at_rest: bool = False  # whether it is at rest there
     held_out_cameras: tuple[int, ...] = ()  # cameras used by evaluation only, although the take is learned from
 
     @property
@@ -65,6 +75,7 @@ class Capture(AbstractArtifact):
     takes: tuple[Take, ...] = ()
     gaussians: Gaussians | None = None  # a trained model, if the capture is one: reconstruction is then left out
     single_object: bool = False  # one object on a plain background: segmentation is then left out
+    moves: Tensor | None = None  # bool, one per Gaussian, where the source knows what moves: likewise left out
     truth: dict[str, float] = field(default_factory=dict)  # material parameters, SI, named as in the material
     truth_source: str = ""  # where `truth` comes from, and how far to trust it
     floor: float | None = None  # height of the ground that things stand on [m]; None: none is known
@@ -91,6 +102,8 @@ class Capture(AbstractArtifact):
             raise ValueError(f"capture {self.name}: all {n} images are held out; leave some to train on")
         if self.points is not None:
             require_finite(f"capture {self.name}: points", self.points)
+        if self.moves is not None and (self.gaussians is None or len(self.moves) != len(self.gaussians)):
+            raise ValueError(f"capture {self.name}: moves needs one value for each of its Gaussians")
         if self.floor is not None and not math.isfinite(self.floor):
             raise ValueError(f"capture {self.name}: floor is {self.floor}; give its height in metres, or None")
         for take in self.takes:
@@ -98,6 +111,8 @@ class Capture(AbstractArtifact):
                 raise ValueError(
                     f"take {take.name}: role {take.role!r} must be learn or evaluate, with one video per camera"
                 )
+            if not all(0 <= take.release < len(video) for video in take.videos):
+                raise ValueError(f"take {take.name}: release is {take.release}, not one of its frames")
 
     @property
     def outline(self) -> Outline:

@@ -7,9 +7,11 @@ import pytest
 import torch
 
 from physics3d.metrics.image import ms_ssim, psnr, ssim
-from physics3d.metrics.motion import flow, flow_error, motion_psnr, moving, oscillation, signal
+from physics3d.metrics.motion import flow_error, motion_psnr, oscillation, signal
 from physics3d.metrics.scores import Scores
 from physics3d.metrics.video import vmaf
+from physics3d.motion.flow import flow
+from physics3d.motion.shapes import moving
 
 FPS = 30.0
 

@@ -78,7 +78,7 @@ def test_what_is_left_out_says_the_time_it_took_elsewhere(tmp_path):
 @pytest.mark.parametrize(
     "word, message",
     [
-        ("learn.frames=31", r"learn: learn\.frames is 31, but take learn has 30 frames; lower it"),
+        ("learn.duration=0.1", r"learn: learn\.frames is 15, but take learn has 4 frames in 0\.1 s"),
         ("scene.prompts.0.view=view_040", r"segment: prompt: view 'view_040' is not in carnation; .*view_000"),
         ("scene.prompts=[]", r"segment: segment\.prompts is empty and carnation has no mattes"),
     ],

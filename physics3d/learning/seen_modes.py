@@ -1,0 +1,131 @@
+"""How the modes of a body look in a clip: the flow of the clip in terms of the basis of the solver without a grid.
+
+Small displacements of a body are u(X) = sum_j s_j(X) q_j (`modes/model.py`); a camera sees the visible point X(x) of
+pixel x move by
+
+    u(t, x) = J(x) (q(t) - q(t_0)) [px],    J = d(projection)/dX at X(x), times s_j(X(x))
+
+from the frame t_0 in which the body is where its Gaussians are. All that a fit needs of the clip are the sums over
+pixels, weighted by how far the flow can be trusted (`motion/flow.py`),
+
+    G(t) = sum_x w J^T J,     b(t) = sum_x w J^T u,     e(t) = sum_x w |u|^2
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from scipy import ndimage
+from torch import Tensor
+
+from physics3d.filling.body import Body
+from physics3d.gaussians.cameras import Camera
+from physics3d.gaussians.embedding import embed
+from physics3d.gaussians.model import Gaussians
+from physics3d.gaussians.rasterize import rasterize
+from physics3d.motion.flow import flow, trust
+
+MOST_PIXELS = 6000  # that are looked at: flow is smooth over its patches
+FADE = 4.0  # over which the motion fades out beyond the outline [px]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sight:
+    """What a camera sees of a body's basis of m amplitudes."""
+
+    thing: Bool[np.ndarray, "h w"]  # pixels in which the moving body is seen
+    pixel: Int[np.ndarray, "n 2"]  # row and column of those that are looked at
+    jacobian: Float[np.ndarray, "n 2 m"]  # J [px per m]
+
+    def displacement(self, q: Float[np.ndarray, " m"]) -> Float[np.ndarray, "h w 2"]:
+        """What the amplitudes [m] move every pixel by [px]; beyond the outline that of the nearest pixel fades out."""
+        h, w = self.thing.shape
+        sparse = np.zeros((h, w, 2), np.float32)
+        marked = np.ones((h, w), bool)
+        sparse[tuple(self.pixel.T)] = self.jacobian @ q
+        marked[tuple(self.pixel.T)] = False
+        _, nearest = ndimage.distance_transform_edt(marked, return_indices=True)
+        away = ndimage.distance_transform_edt(~self.thing)
+        return sparse[tuple(nearest)] * np.exp(-((away / FADE) ** 2))[..., None].astype(np.float32)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Observed:
+    """The sums of a clip, frame by frame, in pixels."""
+
+    gram: Float[np.ndarray, "t m m"]  # G
+    right: Float[np.ndarray, "t m"]  # b
+    square: Float[np.ndarray, " t"]  # e
+    weight: Float[np.ndarray, " t"]  # sum_x w
+    pixels: int
+    fps: float  # [1/s]
+
+    def window(self, first: int, end: int) -> "Observed":
+        """Frames first to end - 1."""
+        part = {name: getattr(self, name)[first:end] for name in ("gram", "right", "square", "weight")}
+        return Observed(**part, pixels=self.pixels, fps=self.fps)
+
+
+def sight(gaussians: Gaussians, body: Body, camera: Camera, basis: Float[np.ndarray, "p r"]) -> Sight:
+    """`basis`: values of the functions at the body's particles. Raises ValueError if the camera sees none of it."""
+    moving = torch.zeros(len(gaussians))
+    moving[body.embedding.which] = 1.0
+    with torch.no_grad():
+        drawn = rasterize(
+            gaussians.mean,
+            gaussians.covariance(),
+            gaussians.opacity,
+            moving[:, None].expand(-1, 3).contiguous(),
+            camera,
+            background=(0.0, 0.0, 0.0),
+            median=True,
+        )
+    assert drawn.median is not None
+    thing = ((drawn.color[..., 0] > 0.5) & (drawn.median > 0)).numpy()
+    if not thing.any():
+        raise ValueError("the camera of the take does not see the thing; check its mask and the camera's place")
+    pixel = np.argwhere(thing)
+    pixel = pixel[:: max(1, len(pixel) // MOST_PIXELS)]
+    origin, ray = camera.rays(torch.float64)
+    at = tuple(torch.from_numpy(pixel.T))
+    point = origin + ray[at] * drawn.median[at].double()[:, None]
+    tie = embed(point.float(), torch.arange(len(point)), body.position, body.spacing)
+    values = np.einsum("nk,nkr->nr", tie.weights.numpy(), basis[tie.neighbours.numpy()])
+    local = point @ camera.world_to_camera[:3, :3].double().T + camera.world_to_camera[:3, 3].double()
+    x, y, z = local.T
+    zero = torch.zeros_like(z)
+    seen = torch.stack(
+        [
+            torch.stack([camera.fx / z, zero, -camera.fx * x / z**2], -1),
+            torch.stack([zero, camera.fy / z, -camera.fy * y / z**2], -1),
+        ],
+        1,
+    )
+    seen = (seen @ camera.world_to_camera[:3, :3].double()).numpy()
+    jacobian = np.einsum("nr,nci->ncri", values, seen).reshape(len(pixel), 2, -1)
+    return Sight(thing=thing, pixel=pixel, jacobian=jacobian)
+
+
+def observe(
+    sight: Sight, frames: UInt8[Tensor, "t h w 3"], fps: float, *, reference: UInt8[Tensor, "h w 3"]
+) -> tuple[Observed, Float[np.ndarray, "t h w 2"]]:
+    """(the sums of the frames, the flow) from the picture `reference`, in which the body is where its Gaussians are."""
+    video = torch.cat([reference[None], frames])
+    u = flow(video)
+    weight = trust(video, u)[1:]
+    u = u[1:]
+    i, j = sight.pixel.T
+    W, U, J = weight[:, i, j].astype(float), u[:, i, j].astype(float), sight.jacobian
+    flat = J.reshape(-1, J.shape[-1])
+    gram = np.stack([flat.T @ (np.repeat(w, 2)[:, None] * flat) for w in W])
+    right = (W[..., None] * U).reshape(len(U), -1) @ flat
+    observed = Observed(
+        gram=gram,
+        right=right,
+        square=(W[..., None] * U**2).sum((1, 2)),
+        weight=W.sum(1),
+        pixels=len(i),
+        fps=fps,
+    )
+    return observed, u

@@ -1,0 +1,108 @@
+"""A take whose cause nobody knows: what its camera sees of the body, and the material that makes it swing so."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from torch import Tensor
+
+from physics3d.filling.body import Body
+from physics3d.gaussians.model import Gaussians
+from physics3d.learning.free_body import estimate, reduced
+from physics3d.learning.free_motion import FreeMotion, Material, Reduced, fit
+from physics3d.learning.seen_modes import Observed, Sight, observe, sight
+from physics3d.log import Log
+from physics3d.modes.model import Model
+from physics3d.motion.decay import Decay
+from physics3d.motion.release import free_decay
+from physics3d.motion.shapes import moving, shapes
+from physics3d.scenes.base import Capture, Take
+from physics3d.world import Estimate, World
+
+SHAPES = 3  # of the flow, that the clip's frequencies are read off
+LEAST = 12  # frames that a motion is learned from
+
+
+@dataclass(frozen=True, kw_only=True)
+class Swung:
+    """A body with its first take, ready to be fitted."""
+
+    reduced: Reduced
+    model: Model
+    sight: Sight
+    picture: Tensor  # uint8 [h, w, 3], in which the body is where its Gaussians are
+    take: Take
+
+
+def frames_seen(take: Take) -> int:
+    """How many of its first frames may be looked at."""
+    return take.seen or len(take.videos[0]) // 2
+
+
+def swung(world: World, capture: Capture, gaussians: Gaussians, body: Body, *, zones: int, log: Log) -> Swung:
+    """Raises ValueError if the first take is too short, or as `reduced` and `sight` do."""
+    take = capture.take("learn")
+    assert take is not None and take.posed is not None
+    if frames_seen(take) < LEAST:
+        raise ValueError(f"take {take.name}: {frames_seen(take)} frames are seen; a motion needs at least {LEAST}")
+    camera = take.cameras[0]
+    centre = body.position.double().mean(0, keepdim=True)
+    scale = float(camera.fx / camera.project(centre)[1])
+    small, model = reduced(world, body, zones=zones, scale=scale, log=log)
+    return Swung(
+        reduced=small,
+        model=model,
+        sight=sight(gaussians, body, camera, model.values),
+        picture=take.videos[0][take.posed],
+        take=take,
+    )
+
+
+def first_take(body: Swung, log: Log) -> tuple[Observed, Float[np.ndarray, "t h w 2"], Decay, int]:
+    """(sums, flow, free decay and release of the frames seen)."""
+    frames = body.take.videos[0][: frames_seen(body.take)]
+    clip, u = observe(body.sight, frames, body.take.fps, reference=body.picture)
+    where = moving(u)
+    if where is None:
+        raise ValueError(f"take {body.take.name}: nothing moves in the {len(frames)} frames that are seen")
+    where &= body.sight.thing
+    weight = np.ones(u.shape[:3], np.float32)
+    decay, release = free_decay(shapes(u, weight, where, count=SHAPES).signal, body.take.fps)
+    if decay.main() is None:
+        raise ValueError(
+            f"take {body.take.name}: what moves does not swing; a material is learned from what has been let go"
+        )
+    log.info(f"free from frame {release} on; largest oscillation {decay.frequency[decay.main()]:.3g} Hz")
+    return clip, u, decay, release
+
+
+def learned_free(world: World, capture: Capture, gaussians: Gaussians, body: Body, *, zones: int, log: Log) -> Estimate:
+    """The material, from the frames seen of the first take."""
+    ready = swung(world, capture, gaussians, body, zones=zones, log=log)
+    clip, _, decay, release = first_take(ready, log)
+    main = decay.main()
+    assert main is not None and ready.take.posed is not None
+    material, motion = fit(
+        ready.reduced,
+        clip,
+        release=release,
+        reference=None if ready.take.at_rest else ready.take.posed,
+        frequency=float(decay.frequency[main]),
+        log=log,
+    )
+    report(motion, material, log)
+    return estimate(world, material, ready.reduced.zone)
+
+
+def report(motion: FreeMotion, material: Material, log: Log) -> None:
+    """The modes that are seen, in words and numbers."""
+    loud = np.argsort(-motion.loudness)[:3]
+    for k in loud:
+        log.info(
+            f"mode at {motion.frequency[k]:.3g} Hz, damping {motion.damping[k]:.2g} 1/s: {motion.loudness[k]:.2g} px"
+        )
+    log.info(f"the material explains {100 * (1 - motion.unexplained):.1f} % of the motion that is seen")
+    log.metric("explained", 1 - motion.unexplained)
+    for name in ("frequency", "damping"):
+        log.metric(f"{name}_of_the_loudest_mode", float(getattr(motion, name)[loud[0]]))
+    log.metric("branch_ratio", float(np.exp(material.ratio)))

@@ -1,0 +1,57 @@
+"""All measures of a clip against a reference: likeness of the pictures and of the motion, and why one is missing."""
+
+import numpy as np
+from jaxtyping import UInt8
+from torch import Tensor
+
+from physics3d.metrics.image import ms_ssim, psnr, ssim
+from physics3d.metrics.motion import flow_error, motion_psnr, oscillation, phase_error, signal
+from physics3d.metrics.video import vmaf
+from physics3d.motion.flow import flow
+from physics3d.motion.shapes import moving
+
+Cells = dict[str, tuple[float | None, str]]  # measure -> (number, "") or (None, why there is none)
+STILL = "the reference moves by less than half a pixel"
+
+
+class Reference:
+    """A clip to compare with: its flow and its oscillation are found once."""
+
+    def __init__(self, clip: UInt8[Tensor, "t h w 3"], fps: float):
+        self.clip, self.fps = clip, fps
+        self.u = flow(clip)
+        self.where = moving(self.u)
+        self.swing, self.why = (None, STILL) if self.where is None else self._swing(self.u)
+
+    def itself(self) -> tuple[Cells, str]:
+        """Frequency and damping of the reference, and why it has no oscillation if so."""
+        if self.where is None:
+            return self._cells(None, STILL), ""
+        return self._cells(self.swing, ""), self.why
+
+    def measure(self, clip: UInt8[Tensor, "t h w 3"]) -> tuple[Cells, str]:
+        """Every measure, and why the clip has no oscillation if so. Raises ValueError for unequal shapes."""
+        cells: Cells = {"psnr": (psnr(clip, self.clip), ""), "ssim": (ssim(clip, self.clip), "")}
+        cells |= {"ms_ssim": ms_ssim(clip, self.clip), "vmaf": vmaf(clip, self.clip)}
+        motion, why = self.motion(clip)
+        return cells | motion, why
+
+    def motion(self, clip: UInt8[Tensor, "t h w 3"]) -> tuple[Cells, str]:
+        """The measures of the motion alone."""
+        cells: Cells = {"motion_psnr": motion_psnr(clip, self.clip)}
+        if self.where is None:
+            return cells | {"flow_error": (None, STILL)} | self._cells(None, STILL), ""
+        u = flow(clip)
+        cells["flow_error"] = flow_error(u, self.u, self.where), ""
+        found, why = self._swing(u)
+        return cells | self._cells(found, ""), why
+
+    def _swing(self, u: np.ndarray):
+        assert self.where is not None
+        return oscillation(signal(u, self.u, self.where), self.fps)
+
+    def _cells(self, found, why: str) -> Cells:
+        if found is None:
+            return {name: (None, why) for name in ("frequency", "damping", "phase")}
+        ahead = None if self.swing is None else phase_error(found, self.swing)
+        return {"frequency": (found.frequency, ""), "damping": (found.damping, ""), "phase": (ahead, "")}

@@ -1,0 +1,100 @@
+"""Takes from files: clips of a thing that moves, filmed by a camera on a stand, by someone who did not write down what
+pushed it, when, or where the camera stood.
+
+What such a clip says by itself is read and checked here, in seconds. What it does not say stays open: the camera, until
+it is registered with the photographs (`FilmedTake.seen_by`), and the excitation, which is None: from the frame of the
+release the motion is free, and learning finds the state it starts from.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, UInt8
+from torch import Tensor
+
+from physics3d.gaussians.cameras import Camera
+from physics3d.motion.clip import SIDE, read_clip
+from physics3d.motion.decay import Decay
+from physics3d.motion.usable import check_clip
+from physics3d.scenes.base import Take
+from physics3d.scenes.unposed import VIDEOS
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilmedTake:
+    """A take whose camera is to be found."""
+
+    name: str
+    role: str  # "learn" or "evaluate"
+    fps: float  # [1/s]
+    video: UInt8[Tensor, "t h w 3"]
+    where: Bool[np.ndarray, "h w"]  # what moves
+    release: int  # first frame from which the motion is a free decay
+    rest: int  # the frame nearest to rest
+    decay: Decay  # frequencies and dampings, of what moves, at first sight
+
+    def seen_by(self, camera: Camera) -> Take:
+        """The take of a camera that is now known. Raises ValueError if its pictures have another size."""
+        h, w = self.video.shape[1:3]
+        if (camera.height, camera.width) != (h, w):
+            raise ValueError(
+                f"take {self.name} has frames of {w} x {h} px, the camera {camera.width} x {camera.height}; scale it"
+            )
+        return Take(
+            name=self.name,
+            role=self.role,
+            fps=self.fps,
+            cameras=(camera,),
+            videos=(self.video,),
+            excitation=None,
+            release=self.release,
+        )
+
+
+def clip_files(path: Path, pattern: str = "*") -> list[Path]:
+    """The clip itself, or the clips of a folder whose names fit, in their order. Raises ValueError if there is none."""
+    if path.is_dir():
+        found = sorted(p for p in path.glob(pattern) if p.suffix.lower() in VIDEOS and not p.name.startswith("."))
+        if not found:
+            raise ValueError(f"{path} holds no clip {pattern} ({', '.join(VIDEOS)}); put one there")
+        return found
+    if not path.is_file():
+        raise ValueError(f"no clip at {path}; check the path")
+    return [path]
+
+
+def filmed_takes(
+    path: Path,
+    *,
+    log,
+    pattern: str = "*",
+    fps: float | None = None,
+    longest_side: int = SIDE,
+    box: tuple[float, float, float, float] | None = None,
+) -> list[FilmedTake]:
+    """A clip, or a folder of clips of one thing: the first is learned from, the others are predicted.
+
+    Raises ValueError in one line, before anything costs minutes, for a clip that cannot be read or used (see
+    `motion/clip.py` and `motion/usable.py`), and RuntimeError where there is no ffmpeg.
+    """
+    takes = []
+    for number, file in enumerate(clip_files(path, pattern)):
+        clip = read_clip(file, fps=fps, longest_side=longest_side)
+        for note in clip.notes:
+            log.info(f"{file.name}: {note}")
+        found = check_clip(clip, box=box)
+        log.info(f"{file.name}: {len(clip.frames)} frames at {clip.fps:g} fps; {found.said()}")
+        takes.append(
+            FilmedTake(
+                name=file.stem,
+                role="evaluate" if number else "learn",
+                fps=clip.fps,
+                video=clip.frames,
+                where=found.where,
+                release=found.release,
+                rest=found.rest,
+                decay=found.decay,
+            )
+        )
+    return takes

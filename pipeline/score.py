@@ -1,0 +1,103 @@
+"""Scores of any two videos: make score REAL=clip.mp4 PRED=clip.mp4 [OUT=folder], by way of the environment.
+
+The first half of the real clip counts as seen. On the second, PRED stands beside pictures that do not move, made from
+what was seen; the motion is also compared over the whole clip. Table on the terminal; score.md and pictures in OUT, or
+in a folder beside PRED. Exit codes: 0 done, 1 the clips cannot be compared, 2 REAL or PRED is not given, 130 Ctrl-C.
+"""
+
+import os
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+USAGE = "make score REAL=<clip> PRED=<clip> [OUT=<folder>]: any two videos of one motion, from the same camera"
+
+
+def main(environment: Mapping[str, str]) -> int:
+    real, predicted = environment.get("REAL", ""), environment.get("PRED", "")
+    if not real or not predicted:
+        print(f"error: {'PRED' if real else 'REAL'} is not given; {USAGE}", file=sys.stderr)
+        return 2
+    target = Path(predicted)
+    folder = Path(environment.get("OUT") or target.with_name(f"{target.stem}_score"))
+    try:
+        score(Path(real), target, folder)
+    except (ValueError, RuntimeError, OSError) as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("\ninterrupted; there is no score.md", file=sys.stderr)
+        return 130
+    return 0
+
+
+def score(real: Path, predicted: Path, folder: Path) -> None:
+    """Raises ValueError or RuntimeError in one line if the two cannot be compared, or the real one does not move."""
+    import torch
+    from rich.console import Console
+
+    from physics3d.log import Log
+    from physics3d.metrics.against import Reference
+    from physics3d.metrics.image import psnr_per_frame, ssim_per_frame
+    from physics3d.metrics.pair import paired
+    from physics3d.metrics.pictures import busiest, curves, slices
+    from physics3d.metrics.scores import Scores
+    from physics3d.motion.clip import read_clip
+    from physics3d.motion.stills import stills
+    from physics3d.pictures import contact_sheet
+
+    pair = paired(read_clip(real), read_clip(predicted))
+    whole = Reference(pair.real, pair.fps)
+    if whole.where is None:
+        raise ValueError(f"{real.name}: nothing moves in it (less than half a pixel); there is no motion to score")
+    seen = len(pair.real) // 2
+    half = Reference(pair.real[seen:], pair.fps)
+    notes = {str(i + 1): note for i, note in enumerate(pair.notes)}
+    clips = {"prediction": pair.predicted[seen:], **stills(pair.real, seen=seen)}
+    second = {"real": half.itself()[0]} | {name: half.measure(clip)[0] for name, clip in clips.items()}
+    all_of_it = {"real": whole.itself()[0], "prediction": whole.motion(pair.predicted)[0]}
+    tables = [
+        (title, Scores(values={name: plain(cells, title, notes) for name, cells in rows.items()}))
+        for title, rows in (("second half", second), ("motion over the whole clip", all_of_it))
+    ]
+
+    log = Log(folder, quiet=True)
+    done = log.path("score.md")
+    done.unlink(missing_ok=True)  # it is written last: whoever finds it finds everything
+    text = [f"# {predicted.name} against {real.name}", ""]
+    text += [f"{len(pair.real)} frames at {pair.fps:g} fps, {pair.real.shape[2]} x {pair.real.shape[1]} px; the first"]
+    text[-1] += f" {seen} count as seen."
+    console = Console(highlight=False, width=None if sys.stdout.isatty() else 160)
+    console.print(text[-1], markup=False)
+    for title, scores in tables:
+        scores.check()
+        console.print(f"\n{title}", markup=False)
+        console.print(*scores.tables())
+        text += ["", f"## {title.capitalize()}", "", scores.markdown()]
+    for note in notes.values():
+        console.print(note, markup=False)
+    text += ["", *(f"- {note}" for note in notes.values())]
+    per_frame = {
+        "PSNR [dB]": {name: psnr_per_frame(clip, pair.real[seen:]) for name, clip in clips.items()},
+        "SSIM": {name: ssim_per_frame(clip, pair.real[seen:]) for name, clip in clips.items()},
+    }
+    log.image("curves", curves(per_frame, pair.fps, first=seen))
+    log.image("slices", slices(["real", "prediction"], [pair.real, pair.predicted], *busiest(pair.real)))
+    strips = [pair.real, pair.predicted, 255 - (pair.real.int() - pair.predicted.int()).abs().to(pair.real.dtype)]
+    log.image("frames", contact_sheet(torch.cat(strips, 1), columns=8, count=8))
+    pictures = (("frames", "real, prediction, difference"), ("curves", "per frame"), ("slices", "space-time slices"))
+    text += ["", *(f"![{what}](previews/{name}.png)" for name, what in pictures)]
+    done.write_text("\n".join(text) + "\n")
+    console.print(f"written   {done} and {folder / 'previews'}", markup=False)
+
+
+def plain(cells, title: str, notes: dict[str, str]) -> dict[str, float | None]:
+    """Numbers alone; why one is missing goes to the notes."""
+    for name, (_, why) in cells.items():
+        if why:
+            notes.setdefault(f"{title} {name}", f"{name} ({title}): {why}")
+    return {name: value for name, (value, _) in cells.items()}
+
+
+if __name__ == "__main__":
+    sys.exit(main(os.environ))

@@ -1,0 +1,153 @@
+"""Recorded motions of unknown cause -> what comes next, as the material says, beside what it says without physics.
+
+Of the take that was learned from the second half is foretold, of the others all that follows their first half second
+from the release on, in which only their start is sought. Every prediction stands beside still pictures, the image
+modes of what was seen, and the material before it was learned.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+import torch
+from annotated_types import Ge, Le
+from torch import Tensor
+
+from physics3d.checks import Duration, require_fields
+from physics3d.filling.body import Body
+from physics3d.gaussians.model import Gaussians
+from physics3d.learning.foretold import foretold
+from physics3d.learning.free_body import material_of
+from physics3d.learning.free_motion import Material, start
+from physics3d.learning.seen_modes import observe
+from physics3d.learning.unknown_cause import Swung, first_take, frames_seen, swung
+from physics3d.log import Log
+from physics3d.metrics.against import Reference
+from physics3d.metrics.image import psnr_per_frame, ssim_per_frame
+from physics3d.metrics.pictures import busiest, curves, slices
+from physics3d.metrics.scores import REFERENCE, Scores
+from physics3d.motion.image_modes import image_modes
+from physics3d.motion.stills import stills
+from physics3d.pictures import contact_sheet
+from physics3d.scenes.base import Capture, Take
+from physics3d.video import write_mp4
+from physics3d.world import Estimate, World
+
+LEARNED, START, IMAGE = "learned material", "material before", "image modes"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Foretell:
+    """Foretells every take and scores it."""
+
+    world: World
+    told: Duration = 0.5  # of other takes, from the release on [s]
+    zones: Annotated[int, Ge(1), Le(16)] = 4  # of stiffness, as in Learn
+
+    def __call__(self, capture: Capture, gaussians: Gaussians, body: Body, estimate: Estimate, *, log: Log) -> Scores:
+        """Rows are "take: prediction". Raises ValueError as `swung` does."""
+        require_fields(self, "foretell")
+        ready = swung(self.world, capture, gaussians, body, zones=self.zones, log=log)
+        clip, flow, _, release = first_take(ready, log)
+        learned = material_of(self.world, estimate, ready.reduced.zone)
+        before = material_of(self.world, self.world.estimate(), ready.reduced.zone)
+        take, posed = ready.take, ready.take.posed
+        assert posed is not None
+        scores, notes = {}, {}
+        reference = None if take.at_rest else (posed - release) / take.fps
+        pose: dict[str, np.ndarray | None] = {}
+        seen = frames_seen(take)
+        motions = {}
+        for name, material in ((LEARNED, learned), (START, before)):
+            window = clip.window(release, seen)
+            motion, _ = start(ready.reduced, material, window, since=0.0, reference=reference)
+            motions[name] = motion
+            pose[name] = None if reference is None else motion.at(reference)
+        scores |= self.judged(ready, take, motions, flow[-1], release=release, seen=seen, notes=notes, log=log)
+        for other in capture.takes:
+            if other is not take:
+                scores |= self.other(ready, other, {LEARNED: learned, START: before}, pose, notes, log)
+        table = Scores(values=scores, notes=notes)
+        table.check()
+        for row, cells in scores.items():
+            for measure, value in cells.items():
+                if value is not None and math.isfinite(value):
+                    log.metric(f"{row}/{measure}", value)
+        if log.folder is not None:
+            log.path("scores.md").write_text(table.markdown() + "\n")
+        return table
+
+    def other(
+        self,
+        ready: Swung,
+        take: Take,
+        materials: dict[str, Material],
+        pose: dict[str, np.ndarray | None],
+        notes: dict[str, str],
+        log: Log,
+    ) -> dict[str, dict[str, float | None]]:
+        """A take that was not learned from: its start alone is sought, in what is told of it."""
+        frames, release = take.videos[0], take.release
+        seen = min(release + max(4, round(self.told * take.fps)), len(frames) - 8)
+        if seen - release < 4:
+            notes[take.name] = f"{len(frames)} frames, free from {release} on, are too few to be foretold"
+            return {}
+        clip, flow = observe(ready.sight, frames[:seen], take.fps, reference=ready.picture)
+        motions = {
+            name: start(ready.reduced, material, clip.window(release, seen), since=0.0, known=pose[name])[0]
+            for name, material in materials.items()
+        }
+        return self.judged(ready, take, motions, flow[-1], release=release, seen=seen, notes=notes, log=log)
+
+    def judged(
+        self,
+        ready: Swung,
+        take: Take,
+        motions: dict,
+        moved: np.ndarray,
+        *,
+        release: int,
+        seen: int,
+        notes: dict[str, str],
+        log: Log,
+    ) -> dict[str, dict[str, float | None]]:
+        """Measures and pictures of what follows frame `seen` - 1."""
+        frames, fps = take.videos[0], take.fps
+        future = frames[seen:]
+        times = (np.arange(seen, len(frames)) - release) / fps
+        last = (seen - 1 - release) / fps
+        clips: dict[str, Tensor] = {
+            name: foretold(frames[seen - 1], ready.sight, motion, moved, last=last, times=times)
+            for name, motion in motions.items()
+        }
+        clips[IMAGE] = image_modes(frames[:seen], fps).frames(range(seen, len(frames)))
+        clips |= stills(frames, seen=seen)
+        measured = Reference(future, fps)
+        rows = {f"{take.name}: {REFERENCE}": _plain(measured.itself()[0], take.name, notes)}
+        for name, clip in log.progress(list(clips.items()), f"scoring {take.name}"):
+            rows[f"{take.name}: {name}"] = _plain(measured.measure(clip)[0], take.name, notes)
+        self.pictures(take, clips, seen, log)
+        return rows
+
+    def pictures(self, take: Take, clips: dict[str, Tensor], seen: int, log: Log) -> None:
+        """A film of the take beside what was foretold, curves over the frames, and space-time slices."""
+        if log.folder is None:
+            return
+        future = take.videos[0][seen:]
+        write_mp4(log.path(f"{take.name}.mp4"), torch.cat([future, clips[LEARNED]], 2), take.fps)
+        log.image(f"{take.name}_frames", contact_sheet(torch.cat([future, clips[LEARNED]], 1), columns=8, count=8))
+        lines = {
+            "PSNR [dB]": {name: psnr_per_frame(clip, future) for name, clip in clips.items()},
+            "SSIM": {name: ssim_per_frame(clip, future) for name, clip in clips.items()},
+        }
+        log.image(f"{take.name}_curves", curves(lines, take.fps, first=seen))
+        shown = ["recorded", LEARNED, IMAGE]
+        log.image(f"{take.name}_slices", slices(shown, [future, clips[LEARNED], clips[IMAGE]], *busiest(future)))
+
+
+def _plain(cells, name: str, notes: dict[str, str]) -> dict[str, float | None]:
+    for measure, (_, why) in cells.items():
+        if why:
+            notes.setdefault(f"{name}: {measure}", why)
+    return {measure: value for measure, (value, _) in cells.items()}

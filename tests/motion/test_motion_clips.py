@@ -1,0 +1,161 @@
+"""Clips as people have them, written by ffmpeg, read and judged; every fault of a clip is one line."""
+
+import dataclasses
+import subprocess
+
+import numpy as np
+import pytest
+import torch
+from clips import FPS, decaying, encode, swaying
+
+from physics3d.log import Log
+from physics3d.motion.clip import read_clip
+from physics3d.motion.usable import check_clip
+from physics3d.scenes.clips import filmed_takes
+from physics3d.video import ffmpeg
+
+SECONDS = 2.0
+SWAY = decaying(np.arange(int(SECONDS * FPS)) / FPS)
+
+
+@pytest.fixture(scope="module")
+def sway():
+    return swaying(SWAY)
+
+
+@pytest.mark.parametrize(
+    "words", [("-c:v", "libx264", "-crf", "8"), ("-c:v", "libx265", "-crf", "8")], ids=["h264", "hevc"]
+)
+@pytest.mark.parametrize("fps", [24.0, 29.97, 60.0])
+def test_frames_and_rate_come_back(tmp_path, sway, words, fps):
+    path = tmp_path / "clip.mov"
+    encode(sway[:20], path, *words, "-pix_fmt", "yuv444p", fps=fps)
+    clip = read_clip(path)
+    assert clip.frames.shape == sway[:20].shape and clip.size == (128, 96) and clip.notes == ()
+    assert clip.fps == pytest.approx(fps, rel=1e-3)  # containers count in thousandths of a second or finer
+    assert (clip.frames.float() - sway[:20].float()).abs().mean() < 3  # grey levels, of a codec at high quality
+
+
+def test_a_clip_on_its_side_is_turned_upright_and_that_is_said(tmp_path, sway):
+    encode(sway[:12], tmp_path / "flat.mp4")
+    words = [ffmpeg(), "-v", "error", "-display_rotation", "90", "-i", str(tmp_path / "flat.mp4"), "-c", "copy"]
+    subprocess.run([*words, str(tmp_path / "phone.mp4")], check=True)
+    clip = read_clip(tmp_path / "phone.mp4")
+    upright = torch.rot90(sway[:12], 1, (1, 2))  # by 90 degrees against the clock
+    assert clip.frames.shape == upright.shape and clip.size == (96, 128)
+    assert (clip.frames.float() - upright.float()).abs().mean() < 5
+    assert "turned by" in " ".join(clip.notes)
+
+
+def test_a_variable_rate_is_made_constant_and_that_is_said(tmp_path, sway):
+    """Every third frame of the middle second is dropped, as phones do in the dark; times stay right."""
+    encode(sway, tmp_path / "even.mp4")
+    chosen = "select='not(between(n,15,45)*not(mod(n,3)))'"
+    words = [ffmpeg(), "-v", "error", "-i", str(tmp_path / "even.mp4"), "-vf", chosen, "-fps_mode", "passthrough"]
+    subprocess.run([*words, "-c:v", "libx264", "-crf", "8", str(tmp_path / "uneven.mp4")], check=True)
+    clip = read_clip(tmp_path / "uneven.mp4")
+    assert "variable frame rate" in clip.notes[0]
+    assert len(clip.frames) / clip.fps == pytest.approx(SECONDS, abs=2 / clip.fps)
+    # frame i shows the instant i/fps: nearer to the true one than to those two frames of the original away
+    for i in (5, len(clip.frames) // 2, len(clip.frames) - 6):
+        at = round(i / clip.fps * FPS)
+        distance = [(clip.frames[i].float() - sway[k].float()).abs().mean() for k in (at, at - 3, at + 3)]
+        assert distance[0] < min(distance[1:])
+
+
+def test_size_and_piece_are_chosen(tmp_path, sway):
+    encode(sway, tmp_path / "clip.mp4")
+    clip = read_clip(tmp_path / "clip.mp4", longest_side=64, start=0.5, stop=1.5, fps=15)
+    assert clip.frames.shape == (15, 48, 64, 3) and clip.fps == 15
+    assert "reduced from 128 x 96 to 64 x 48 px" in clip.notes
+
+
+def test_what_is_no_clip_is_refused_in_one_line(tmp_path, sway):
+    (tmp_path / "text.mp4").write_text("not a video")
+    sound = ["-f", "lavfi", "-i", "sine=duration=0.2", str(tmp_path / "sound.m4a")]
+    subprocess.run([ffmpeg(), "-v", "error", *sound], check=True)
+    encode(sway[:1], tmp_path / "one.mp4")
+    encode(sway[:12], tmp_path / "bare.h264", "-c:v", "libx264", "-f", "h264")
+    for name, message in (
+        ("none.mp4", "no clip at"),
+        ("text.mp4", "cannot read the clip text.mp4"),
+        ("sound.m4a", "no video in it"),
+        ("one.mp4", "1 frame"),
+        ("bare.h264", "rate is unknown"),
+    ):
+        with pytest.raises(ValueError, match=message) as error:
+            read_clip(tmp_path / name)
+        assert "\n" not in str(error.value)
+    assert len(read_clip(tmp_path / "bare.h264", fps=30).frames) == 12
+
+
+def test_without_ffmpeg_the_remedy_is_named(tmp_path, sway, monkeypatch):
+    encode(sway[:12], tmp_path / "clip.mp4")
+    import imageio_ffmpeg
+
+    def missing():
+        raise RuntimeError("No ffmpeg exe could be found.")
+
+    monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", missing)
+    with pytest.raises(RuntimeError, match="make setup"):
+        read_clip(tmp_path / "clip.mp4")
+
+
+def judged(tmp_path, frames, **more):
+    encode(frames, tmp_path / "clip.mp4")
+    return check_clip(read_clip(tmp_path / "clip.mp4"), **more)
+
+
+def test_a_good_clip_says_what_moves_how_and_from_when(tmp_path, sway):
+    found = judged(tmp_path, sway, box=(0.1, 0.1, 0.9, 0.9))
+    main = found.decay.main()
+    assert found.decay.frequency[main] == pytest.approx(2.0, rel=0.03) and found.release <= 6
+    assert found.where[48, 64] and not found.where[:4].any()
+    assert abs(SWAY[found.rest]) < 1.0  # of 6 px
+    assert found.largest == pytest.approx(np.abs(SWAY - SWAY[found.rest]).max(), rel=0.15)
+
+
+FAULTS = {
+    "nothing moves": (lambda: swaying(np.zeros(30), noise=1.0), {}),
+    "the camera moves": (lambda: swaying(0.5 * SWAY, camera=1.0), {}),
+    "there is a cut before frame 30": (lambda: torch.cat([swaying(SWAY[:30]), 255 - swaying(SWAY[30:])]), {}),
+    "leaves the picture": (lambda: swaying(10 * SWAY), {}),
+    "shorter than half a period": (lambda: swaying(decaying(np.arange(20) / FPS, frequency=0.25, phase=-1.2)), {}),
+    "the mask is empty": (lambda: swaying(SWAY), {"box": (0.0, 0.0, 0.1, 0.1)}),
+    "box is": (lambda: swaying(SWAY), {"box": (0.5, 0.0, 0.1, 0.1)}),
+    "at least 8": (lambda: swaying(SWAY[:5]), {}),
+}
+
+
+@pytest.mark.parametrize("message", FAULTS)
+def test_every_fault_is_found_and_named(tmp_path, message):
+    make, more = FAULTS[message]
+    with pytest.raises(ValueError, match=message) as error:
+        judged(tmp_path, make(), **more)
+    assert "\n" not in str(error.value)
+
+
+def test_takes_of_a_folder_are_one_to_learn_and_others_to_predict(tmp_path, sway):
+    for name, frames in (("b.mp4", sway), ("a.mov", swaying(-0.7 * SWAY))):
+        encode(frames, tmp_path / name)
+    takes = filmed_takes(tmp_path, log=Log(None))
+    assert [(t.name, t.role) for t in takes] == [("a", "learn"), ("b", "evaluate")]
+    from physics3d.gaussians.cameras import Camera
+
+    camera = Camera(width=128, height=96, fx=100, fy=100, cx=64, cy=48, world_to_camera=torch.eye(4).double())
+    take = takes[0].seen_by(camera)
+    assert take.excitation is None and take.release == takes[0].release and take.fps == FPS
+    with pytest.raises(ValueError, match="scale it"):
+        takes[0].seen_by(dataclasses.replace(camera, width=64))
+    with pytest.raises(ValueError, match="no clip"):
+        filmed_takes(tmp_path / "empty", log=Log(None))
+
+
+@pytest.mark.parametrize("thing", ["carnation", "telephone"])
+def test_the_real_takes_are_usable(data, thing):
+    path = data / thing / "videos" / "real_take3.mp4"
+    if not path.is_file():
+        pytest.skip(f"no {path}")
+    found = check_clip(read_clip(path, longest_side=320))
+    lowest, highest = {"carnation": (2.2, 3.4), "telephone": (1.0, 1.1)}[thing]  # Hz, as read off the recordings
+    assert lowest < found.decay.frequency[found.decay.main()] < highest

@@ -1,0 +1,68 @@
+"""One clip of a thing that swings, from the file to what comes next: against the motion that was drawn."""
+
+import numpy as np
+import pytest
+from clips import FPS, decaying, encode, swinging_rod
+
+from physics3d.log import Log
+from physics3d.materials.viscoelastic import Viscoelastic
+from physics3d.scenes.clip import ClipSource
+from physics3d.world import World
+from stages.fill import Fill
+from stages.foretell import IMAGE, LEARNED, Foretell
+from stages.learn import Learn
+
+FREQUENCY, DAMPING, RADIUS = 2.0, 0.8, 7.0
+
+
+def test_a_clip_alone_tells_how_the_thing_swings_next(tmp_path):
+    path = tmp_path / "rod.mp4"
+    encode(swinging_rod(decaying(np.arange(100) / FPS, FREQUENCY, DAMPING, 11.0), radius=RADIUS), path)
+    capture = ClipSource(name="rod", path=str(path), camera_distance=0.5, box=(0.2, 0.02, 0.8, 0.98))(log=Log(None))
+    capture.check()
+    (take,) = capture.takes
+    assert take.excitation is None and take.posed == len(take.videos[0]) // 2 - 1
+    world = World(
+        material=Viscoelastic(branches=1, elastic=True),
+        start=dict(
+            youngs_modulus=5e4,
+            poissons_ratio=0.3,
+            branch_shear_modulus=1e4,
+            branch_bulk_modulus=2.2e4,
+            shear_relaxation_time=0.3,
+            bulk_relaxation_time=0.3,
+        ),
+        density=500.0,
+        dx=0.024,
+        gravity=(0.0, 0.0, 0.0),
+        solver="modes",
+    )
+    body = Fill(spacing=0.012)(capture, capture.gaussians, None, log=Log(None))
+    assert bool(body.attached.any()) and float(body.position[body.attached, 2].max()) < 0
+    learn = Learn(world=world, prior=None, learn=("youngs_modulus",), zones=1)
+    estimate = learn(capture, capture.gaussians, body, log=Log(None))
+    estimate.check()
+    # a clamped rod of this length and thickness, as assumed: f = 1.875^2/(2 pi L^2) sqrt(E I/(rho A)), I/A = r^2/4
+    camera = take.cameras[0]
+    pixel = 0.5 / camera.fx
+    held = float(body.position[body.attached, 2].max())
+    length = float(body.position[:, 2].max()) - held
+    E = float(estimate.parameters["youngs_modulus"])
+    f = 1.875**2 / (2 * np.pi * length**2) * np.sqrt(E * (RADIUS * pixel) ** 2 / 4 / 500.0)
+    # the branch stiffens it by a few per cent, the body is made of particles nearly as wide as the rod
+    assert f == pytest.approx(FREQUENCY, rel=0.2)
+    scores = Foretell(world=world, zones=1)(capture, capture.gaussians, body, estimate, log=Log(None)).values
+    mine, reference = scores[f"rod: {LEARNED}"], scores["rod: reference"]
+    still = scores["rod: last frame seen, frozen"]
+    assert mine["psnr"] > still["psnr"] + 3 and mine["ssim"] > still["ssim"]
+    assert mine["frequency"] == pytest.approx(FREQUENCY, rel=0.03)
+    assert mine["damping"] == pytest.approx(DAMPING, rel=0.3)
+    assert reference["frequency"] == pytest.approx(FREQUENCY, rel=0.01)
+    assert scores[f"rod: {IMAGE}"]["psnr"] > still["psnr"]
+
+
+def test_a_clip_in_which_nothing_moves_is_refused(tmp_path):
+    encode(swinging_rod(np.zeros(40)), tmp_path / "still.mp4")
+    source = ClipSource(name="still", path=str(tmp_path / "still.mp4"), camera_distance=0.5)
+    with pytest.raises(ValueError, match="nothing moves by more than"):
+        source(log=Log(None))
