@@ -7,7 +7,7 @@ with the node k that they follow (`hold`): with V the imposed velocity and r_i =
     v_k - V_k = sum_i r_i (p_i - m_i V_i)/sum_i r_i^2 m_i      over k itself (r = 1) and all that follow it
     v_i - V_i = r_i (v_k - V_k)
 
-Next to a wall that mirrors they take V. A boundary that grips acts by its own `node` only where it grips nothing.
+p_i and m_i with those of their images where walls mirror. A boundary that grips acts by its own `node` only where it grips nothing.
 """
 
 from functools import cache
@@ -36,6 +36,15 @@ def update(
     grip_row = {hook.boundary: place for place, hook in enumerate(grips)}
     own_grip = tuple(grip_row.get(row, -1) for row in rows)
     grip_count = len(grips)
+
+    @wp.func
+    def whole(
+        at: wp.vec3i, n: int, window: wp.array(dtype=int), walls: wp.array(dtype=int), grid: wp.array(dtype=vec4)
+    ):
+        """Momentum and mass of node n, which is `at`, with those of its images."""
+        if wp.static(mirrored):
+            return folded(at, window, walls, grid)
+        return grid[n]
 
     @wp.kernel(module="unique")
     def update_kernel(
@@ -95,20 +104,28 @@ def update(
             ahead = int(FREE)
             if here >= 0:
                 ahead = leader[wp.max(here, 0)]
-            if ahead == HELD or (ahead >= 0 and near == 1):
-                v = imposed[wp.max(here, 0)]
-                moves = True
-            elif near == 0:
-                top = n
-                if ahead >= 0:
-                    top = ahead
+            top = here
+            if ahead >= 0:
+                top = ahead
+            middle = wp.vec3i()
+            if top >= 0:
                 middle = wp.vec3i(
                     window[0] + top / (window[4] * window[5]), window[1] + (top / window[5]) % window[4],
                     window[2] + top % window[5],
                 )  # fmt: skip
+            if wp.static(mirrored):
+                for axis in range(3):
+                    if middle[axis] < walls[axis] or middle[axis] > walls[3 + axis]:
+                        ahead = wp.where(ahead >= 0, int(HELD), ahead)
+                        top = -1
+            if ahead == HELD:
+                v = imposed[wp.max(here, 0)]
+                moves = True
+            elif top >= 0:
                 V = imposed[top]
-                inertia = grid[top][3]
-                impulse = decay * vec3(grid[top][0], grid[top][1], grid[top][2]) + inertia * (fall - V)
+                lead = whole(middle, top, window, walls, grid)
+                inertia = lead[3]
+                impulse = decay * vec3(lead[0], lead[1], lead[2]) + inertia * (fall - V)
                 followed = 0
                 for k in range(12):
                     step = wp.vec3i(0, 0, 0)
@@ -117,15 +134,15 @@ def update(
                     if other >= 0 and leader[wp.max(other, 0)] == top:
                         followed = 1
                         ratio = depth[other] / depth[top]
-                        mass = grid[other][3]
-                        p = decay * vec3(grid[other][0], grid[other][1], grid[other][2])
-                        impulse = impulse + ratio * (p + mass * (fall - imposed[other]))
-                        inertia = inertia + ratio * ratio * mass
+                        that = whole(middle + step, other, window, walls, grid)
+                        p = decay * vec3(that[0], that[1], that[2])
+                        impulse = impulse + ratio * (p + that[3] * (fall - imposed[other]))
+                        inertia = inertia + ratio * ratio * that[3]
                 if followed == 1:
                     share = real(1.0)
                     if ahead >= 0:
-                        share = depth[n] / depth[top]
-                    v = imposed[n] + share * (impulse / inertia)
+                        share = depth[here] / depth[top]
+                    v = imposed[here] + share * (impulse / inertia)
                     moves = True
         if moves:
             x = origin + dx * vec3(real(at[0]), real(at[1]), real(at[2]))
