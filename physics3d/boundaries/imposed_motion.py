@@ -58,11 +58,18 @@ class ImposedMotion(base.AbstractBoundary):
         count = len(self.times)
         apart = all(b > a for a, b in zip(self.times, self.times[1:]))
         base.require(apart, self, "times", "times of which each is after the one before it")
-        base.require(len(self.displacement) == count, self, "displacement", f"{count} rows, one for each time")
+        self._check_table("displacement", (count, 3), f"{count} rows of 3 numbers, one for each time")
         if self.deformation is not None:
-            base.require(len(self.deformation) == count, self, "deformation", f"{count} matrices, one for each time")
+            self._check_table("deformation", (count, 3, 3), f"{count} matrices of 3 x 3 numbers, one for each time")
             right = bool((torch.linalg.det(self._deformations().detach()) > 0).all())
             base.require(right, self, "deformation", "matrices with a determinant above 0")
+
+    def _check_table(self, field: str, shape: tuple[int, ...], remedy: str) -> None:
+        try:
+            table = torch.as_tensor(getattr(self, field), dtype=torch.float64)
+        except (TypeError, ValueError):  # ragged rows, or something that is no number
+            table = torch.empty(0)
+        base.require(table.shape == shape and bool(table.isfinite().all()), self, field, remedy)
 
     def selection(self, setting: base.Setting) -> Float[Tensor, " p"]:
         selected = base.inside_box(setting.position, self.lower, self.upper)

@@ -7,7 +7,8 @@ with the node k that they follow (`hold`): with V the imposed velocity and r_i =
     v_k - V_k = sum_i r_i (p_i - m_i V_i)/sum_i r_i^2 m_i      over k itself (r = 1) and all that follow it
     v_i - V_i = r_i (v_k - V_k)
 
-p_i and m_i with those of their images where walls mirror. A boundary that grips acts by its own `node` only where it grips nothing.
+p_i and m_i with those of their images where walls mirror. A boundary that grips acts by its own `node` only where it
+grips nothing.
 """
 
 from functools import cache
