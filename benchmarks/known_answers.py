@@ -293,14 +293,15 @@ def cantilever(cells: int, slender: int = 10, **changes) -> Answer:
     """First frequency of a beam `cells` thick, nu = 0: f1 = 1.8751^2/(2 pi L^2) sqrt(E I/(rho A))."""
     thick = 0.1
     dx, length, young = thick / cells, thick * slender, 1e6
-    position, volume = block((cells * slender, 1, cells), dx)
+    # a clamp holds matter: three cells before the beam
+    position, volume = block((3 + cells * slender, 1, cells), dx, lower=(-3 * dx, 0.0, 0.0))
     clamp = FixedRegion(lower=(-1.0, -1.0, -1.0), upper=(0.0, 1.0, 1.0))
     world = _world(
         dx, changes, material=Viscoelastic(branches=0), start=_elastic(young, 0.0), boundaries=(_thin(dx, "y"), clamp)
     )
     b, s = 1.8751040687, 0.7340955138
     frequency = b**2 / (2 * math.pi * length**2) * math.sqrt(young * thick**2 / (12 * DENSITY))
-    y = b * position[:, 0] / length
+    y = b * position[:, 0].clamp(min=0.0) / length
     mode = torch.cosh(y) - torch.cos(y) - s * (torch.sinh(y) - torch.sin(y))
     velocity = torch.zeros_like(position)
     velocity[:, 2] = 1e-3 * mode
