@@ -74,7 +74,7 @@ class Conditions:
     held: np.ndarray  # [p] bool: particles that never move
     loads: tuple[Load, ...]
     grips: tuple[Grip, ...]
-    walls: tuple[AbstractBoundary, ...]
+    walls: tuple[HalfSpace | BoundingBox, ...]
 
 
 def conditions(boundaries: Sequence[AbstractBoundary], setting: Setting, matter: Matter) -> Conditions:
@@ -145,7 +145,7 @@ def conditions(boundaries: Sequence[AbstractBoundary], setting: Setting, matter:
 
 
 def touched(
-    walls: Sequence[AbstractBoundary], position: Float[Tensor, "t p 3"], radius: Float[Tensor, " p"]
+    walls: Sequence[HalfSpace | BoundingBox], position: Float[Tensor, "t p 3"], radius: Float[Tensor, " p"]
 ) -> tuple[AbstractBoundary, int] | None:
     """The first wall that particles at `position` [m], half the edge of a cube large, reach, and in which frame."""
     first = None

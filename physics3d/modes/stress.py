@@ -9,14 +9,13 @@ so that F is that of the basis itself and never drifts. All arrays are float64 a
 row a is the derivative along axis a, as the gradients of the basis are laid out.
 """
 
-import functools
-
 import numpy as np
 import torch
 import warp as wp
 from jaxtyping import Float
 
 from physics3d.materials.base import AbstractMaterial
+from physics3d.modes.kernels import stages
 from physics3d.warp_start import start_warp
 
 
@@ -41,7 +40,7 @@ class Points:
         self._arrays = {name: _array(value) for name, value in self.data.items()}
         self._adjoints = {name: _array(value) for name, value in self.adjoint.items()}
         self.data["memory"][:] = material.initial_memory(n, torch.float64).numpy()
-        self._kernels = _kernels(material.advance(wp.float64))
+        self._kernels = stages(material.advance(wp.float64))
         # recorded once: a launch of few points is all overhead
         self._forward: dict[float, list] = {}
 
@@ -118,62 +117,3 @@ def _array(value: np.ndarray) -> wp.array:
     """The same memory, for Warp."""
     kind = wp.mat33d if value.shape[1:] == (3, 3) else wp.float64
     return wp.array(value, dtype=kind, copy=False, device="cpu")
-
-
-@functools.cache
-def _kernels(function: wp.Function) -> tuple[tuple[wp.Kernel, tuple[str, ...], tuple[str, ...]], ...]:
-    """(kernel, its inputs after dt, its outputs) of the three stages: one each, so that the adjoint of the constitutive
-    function does not evaluate it again."""
-
-    @wp.kernel(module="unique", enable_backward=True)
-    def material_points(
-        # in
-        dt: wp.float64,  # [s]
-        L: wp.array(dtype=wp.mat33d),  # velocity gradient [1/s]
-        H_0: wp.array(dtype=wp.mat33d),  # [n] F - I transposed, at the start [1]
-        coefficients: wp.array2d(dtype=wp.float64),  # [k, n] of the material
-        memory: wp.array2d(dtype=wp.float64),  # [m, n] internal variables
-        # out
-        H_next: wp.array(dtype=wp.mat33d),  # [n] [1]
-        tau: wp.array(dtype=wp.mat33d),  # [Pa]
-        memory_next: wp.array2d(dtype=wp.float64),  # [m, n]
-    ):
-        p = wp.tid()
-        H_p, tau_p = function(p, dt, L[p], wp.transpose(H_0[p]), coefficients, memory, memory_next)
-        H_next[p] = H_p
-        tau[p] = tau_p
-
-    return (
-        (_rate, ("H", "H_0"), ("L",)),
-        (material_points, ("L", "H_0", "coefficients", "memory"), ("H_next", "tau", "memory_next")),
-        (_force, ("tau", "H", "weight"), ("P",)),
-    )
-
-
-@wp.kernel
-def _rate(
-    # in
-    dt: wp.float64,  # [s]
-    H: wp.array(dtype=wp.mat33d),  # [n] F - I transposed [1]
-    H_0: wp.array(dtype=wp.mat33d),  # [n] F - I transposed, at the start [1]
-    # out
-    L: wp.array(dtype=wp.mat33d),  # [1/s]
-):
-    p = wp.tid()
-    one = wp.identity(n=3, dtype=wp.float64)
-    L[p] = wp.transpose(wp.inverse(one + H_0[p]) * (H[p] - H_0[p])) / dt
-
-
-@wp.kernel
-def _force(
-    # in
-    dt: wp.float64,  # [s]
-    tau: wp.array(dtype=wp.mat33d),  # [Pa]
-    H: wp.array(dtype=wp.mat33d),  # [n] F - I transposed [1]
-    weight: wp.array(dtype=wp.float64),  # [m^3]
-    # out
-    P: wp.array(dtype=wp.mat33d),  # transposed [J]
-):
-    p = wp.tid()
-    one = wp.identity(n=3, dtype=wp.float64)
-    P[p] = weight[p] * (wp.transpose(wp.inverse(one + H[p])) * tau[p])
