@@ -152,7 +152,7 @@ def _modes(
 
 
 def _refuse_a_fall(world: World, excitation: tuple[AbstractBoundary, ...]) -> None:
-    """Raises Refused where nothing holds a body that falls or flies towards a wall: said before anything is computed."""
+    """Raises Refused, before anything is computed, where nothing holds a body that falls or flies towards a wall."""
     every = (*world.boundaries, *excitation)
     walls = [type(boundary).__name__ for boundary in every if isinstance(boundary, WALLS)]
     holds = any(not isinstance(boundary, (*WALLS, Impulse)) for boundary in every)
