@@ -46,7 +46,8 @@ def chosen(
         own = np.flatnonzero(group == label)
         rows = max(100, round(count * own_count / n)) + len(pairs)
         if len(own) <= rows:
-            found.append(own), factors.append(np.ones(len(own)))
+            found.append(own)
+            factors.append(np.ones(len(own)))
             continue
         take = rng.permutation(len(own)) < CANDIDATES * rows
         states = rng.standard_normal((2, rows, root.shape[1]))
@@ -65,5 +66,6 @@ def chosen(
         scale[: len(pairs)] *= WEIGHT
         solution, _ = nnls((Y[take] * scale).T, target * scale, maxiter=20 * rows)
         kept = solution > 0
-        found.append(own[take][kept]), factors.append(solution[kept])
+        found.append(own[take][kept])
+        factors.append(solution[kept])
     return np.concatenate(found), np.concatenate(factors)

@@ -41,14 +41,15 @@ class Points:
         self._adjoints = {name: _array(value) for name, value in self.adjoint.items()}
         self.data["memory"][:] = material.initial_memory(n, torch.float64).numpy()
         self._kernels = stages(material.advance(wp.float64))
-        # recorded once: a launch of few points is all overhead
+        # recorded once per dt: a launch of few points is half overhead
         self._forward: dict[float, list] = {}
+        self._backward: dict[float, list] = {}
 
     def stress(self, Ht: Float[np.ndarray, "n 3 3"], dt: float) -> Float[np.ndarray, "n 3 3"]:
         """w P transposed, of the deformation Ht [n, 3, 3] a time dt [s] after the last one that was kept."""
         np.copyto(self.data["H"], Ht)
         if dt not in self._forward:
-            self._forward = {dt: [self._launch(i, dt, record_cmd=True) for i in range(3)]}
+            self._forward = {dt: [self._recorded(i, dt) for i in range(3)]}
         for command in self._forward[dt]:
             command.launch()
         return self.data["P"]
@@ -77,8 +78,10 @@ class Points:
             np.copyto(self.adjoint["P"], P_bar)
         if memory_bar is not None:
             np.copyto(self.adjoint["memory_next"], memory_bar)
-        for i in (2, 1, 0):
-            self._launch(i, dt, adjoint=True)
+        if dt not in self._backward:
+            self._backward = {dt: [self._recorded(i, dt, adjoint=True) for i in (2, 1, 0)]}
+        for command in self._backward[dt]:
+            command.launch()
         return self.adjoint
 
     def tangent(self, Ht: Float[np.ndarray, "n 3 3"], dt: float) -> Float[np.ndarray, "9 n 3 3"]:
@@ -97,7 +100,7 @@ class Points:
         coefficients, memory = (torch.from_numpy(self.data[name]) for name in ("coefficients", "memory"))
         return float(self.material.energy(coefficients, H, memory).numpy() @ self.data["weight"])
 
-    def _launch(self, stage: int, dt: float, *, adjoint: bool = False, record_cmd: bool = False):
+    def _recorded(self, stage: int, dt: float, *, adjoint: bool = False) -> wp.Launch:
         kernel, inputs, outputs = self._kernels[stage]
         pick = lambda names, table: [table[name] for name in names]
         return wp.launch(
@@ -108,7 +111,7 @@ class Points:
             adj_inputs=[None, *pick(inputs, self._adjoints)] if adjoint else [],
             adj_outputs=pick(outputs, self._adjoints) if adjoint else [],
             adjoint=adjoint,
-            record_cmd=record_cmd,
+            record_cmd=True,
             device="cpu",
         )
 
