@@ -24,9 +24,9 @@ def test_a_clamped_beam_one_particle_across_swings_as_in_theory(slender):
     solver = Solver.of(world(young, 0.3), *row(slender, thick), log=Log(None))
     theory = timoshenko(slender * thick, *section("square", thick, 0.3)[:2], young, 0.3, 300.0, 0.85, free=False)
     found = frequencies(solver)
-    # both planes of bending; 2 % for f1, and 5 % for f2 where a wave has few cells of 12 mm
-    np.testing.assert_allclose(found[:2], theory[0], rtol=0.02)
-    np.testing.assert_allclose(found[2:4], theory[1], rtol=0.05 if slender == 10 else 0.02)
+    # both planes of bending; (k H)^2/12 = 2 % in omega^2 of the second mode, where ten cells bend
+    np.testing.assert_allclose(found[:2], theory[0], rtol=0.01)
+    np.testing.assert_allclose(found[2:4], theory[1], rtol=0.01)
 
 
 @pytest.mark.parametrize("shape", ["square", "round"])
