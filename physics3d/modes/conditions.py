@@ -128,10 +128,9 @@ def conditions(boundaries: Sequence[AbstractBoundary], setting: Setting, matter:
         return rest
 
     for lower, upper in boxes:
-        before = len(matter.position)
         matter = take(outside_box(matter, lower, upper))
-        if before == len(matter.position) and not len(pins[-1]):
-            raise Refused(f"FixedRegion from {lower} to {upper} m holds no part of the body; move or enlarge it")
+        if not len(pins[-1]):
+            raise Refused(f"FixedRegion from {lower} to {upper} m holds nothing that the body hangs on; enlarge it")
     for mask in held_particles:
         matter = take(outside_particles(matter, mask))
     if not len(matter.position):

@@ -29,7 +29,7 @@ def elastic(**changes):
 
 
 def lines(folder: Path) -> list[str]:
-    return [line.split("  ", 1)[1] for line in (folder / LINES).read_text().splitlines()]
+    return [line.split(" s  ", 1)[1] for line in (folder / LINES).read_text().splitlines()]
 
 
 PLASTIC = VonMises()
