@@ -83,14 +83,14 @@ def outside_box(matter: Matter, lower: tuple, upper: tuple) -> tuple[Matter, Pin
 
 
 def outside_particles(matter: Matter, held: np.ndarray) -> tuple[Matter, Pins, np.ndarray]:
-    """The matter of the particles that are not in the mask `held` [p], pins in the middle of each link across, and the
+    """The matter of the particles that are not in the mask `held` [p], pins where it touches the rest, and the
     mask of the pieces that are kept."""
     keep = ~held[matter.owner.numpy()]
     return matter.select(keep), _between(matter, keep, np.zeros(len(keep), bool)), keep
 
 
 def _between(matter: Matter, keep: Bool[np.ndarray, " m"], pinned: Bool[np.ndarray, " m"]) -> Pins:
-    """Four pins in the middle of each link from a piece that is kept, and not `pinned` yet, to one that is not."""
+    """Four pins on the face of each piece that is kept, and not `pinned` yet, towards one it is linked to that is not."""
     links = matter.links.numpy()
     across = links[keep[links[:, 0]] != keep[links[:, 1]]]
     free = np.where(keep[across[:, 0]], across[:, 0], across[:, 1])
@@ -106,8 +106,10 @@ def _between(matter: Matter, keep: Bool[np.ndarray, " m"], pinned: Bool[np.ndarr
     tangent = np.linalg.svd(normal[:, None])[2][:, 1:]  # [k, 2, 3]
     wide = np.sqrt(np.einsum("kti,kij,ktj->kt", tangent, S[free], tangent))
     signs = np.array([(1, 1), (1, -1), (-1, 1), (-1, -1)], float)
-    middle = (x[free] + x[fixed]) / 2
-    pin = middle[:, None] + np.einsum("st,kt,kti->ksi", signs, wide, tangent)
-    area = matter.volume.numpy()[free] / (2 * np.sqrt(3 * np.einsum("ki,kij,kj->k", normal, S[free], normal)))
+    half = np.sqrt(3 * np.einsum("ki,kij,kj->k", normal, S[free], normal))
+    # on the face of what is free: in a gap before it, nothing would keep the splines from a kink
+    face = x[free] - np.minimum(half, distance)[:, None] * normal
+    pin = face[:, None] + np.einsum("st,kt,kti->ksi", signs, wide, tangent)
+    area = matter.volume.numpy()[free] / (2 * half)
     number = np.cumsum(keep) - 1
     return Pins(position=pin.reshape(-1, 3), area=np.repeat(area / 4, 4), piece=np.repeat(number[free], 4))

@@ -16,8 +16,7 @@ from physics3d.mpm.rollout import rollout
 from physics3d.solver import motion_of
 
 FALLS = (0.0, 0.0, -9.81)
-POKE = Impulse(force=(0.0, 0.0, 0.002), centre=(0.055, 0.0, 0.0), radius=0.02, duration=0.05)
-PARAMETERS = dict(youngs_modulus=1e4, poissons_ratio=0.3)
+PARAMETERS = {"youngs_modulus": torch.tensor(1e4), "poissons_ratio": torch.tensor(0.3)}
 
 
 def floor(height: float) -> HalfSpace:
@@ -87,10 +86,9 @@ def test_both_solvers_tell_the_same_of_a_poke():
     moved = {}
     for solver in ("grid", "modes"):
         asked = world(1e5, 0.3, solver=solver, dx=0.008, precision="float32")
-        motion = motion_of(
-            asked, position.float(), volume.float(), excitation=(poke,), device="cpu", log=Log(None)
-        )  # fmt: skip
-        end = motion(dict(youngs_modulus=1e5, poissons_ratio=0.3), **timing)
+        body = position.float(), volume.float()
+        motion = motion_of(asked, *body, excitation=(poke,), device="cpu", log=Log(None))
+        end = motion(PARAMETERS | {"youngs_modulus": torch.tensor(1e5)}, **timing)
         moved[solver] = (end.position - end.rest_position).double()
     off = (moved["grid"] - moved["modes"]).norm() / moved["modes"].norm()
     # a thickness of two and a half cells is 3 to 4 % of a frequency on the grid, two fifths of a period

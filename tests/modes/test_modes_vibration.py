@@ -7,6 +7,7 @@ import pytest
 import torch
 from modes_bodies import row, section, timoshenko, turned_beam, world
 
+from physics3d.boundaries.fixed_region import FixedRegion
 from physics3d.log import Log
 from physics3d.materials.viscoelastic import Viscoelastic
 from physics3d.matter import Matter, points
@@ -55,6 +56,19 @@ def radii(matter: Matter, degrees: float) -> np.ndarray:
     y, weight = y[middle, 1:], weight[middle, None]
     centre = (weight * y).sum(0) / weight.sum()
     return (weight * (y - centre) ** 2).sum(0) / weight.sum()
+
+
+def test_a_box_holds_wherever_its_face_runs():
+    """Through the pieces or between two of them, which do not quite meet there: f L^2 is the same."""
+    position, volume = row(12, 0.01)
+    found = []
+    for face in np.linspace(0.021, 0.031, 11):
+        clamp = FixedRegion(lower=(-1.0, -1.0, -1.0), upper=(float(face), 1.0, 1.0))
+        held = world(1e5, 0.3, boundaries=(clamp,))
+        solver = Solver.of(held, position, 0.5 * volume, log=Log(None))  # cubes of 7.9 mm, 2.1 mm apart
+        found.append(frequencies(solver)[0] * (0.12 - face) ** 2)
+    # a gap belongs to neither side: 2.1 mm of 90 is 5 % of f L^2
+    np.testing.assert_allclose(found, np.mean(found), rtol=0.1)
 
 
 def test_a_free_body_has_six_rigid_motions():
