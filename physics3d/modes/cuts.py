@@ -90,7 +90,7 @@ def outside_particles(matter: Matter, held: np.ndarray) -> tuple[Matter, Pins, n
 
 
 def _between(matter: Matter, keep: Bool[np.ndarray, " m"], pinned: Bool[np.ndarray, " m"]) -> Pins:
-    """Four pins on the face of each piece that is kept, and not `pinned` yet, towards one it is linked to that is not."""
+    """Four pins on each face that a piece which is kept, and not `pinned` yet, turns to one that is not kept."""
     links = matter.links.numpy()
     across = links[keep[links[:, 0]] != keep[links[:, 1]]]
     free = np.where(keep[across[:, 0]], across[:, 0], across[:, 1])
