@@ -46,9 +46,9 @@ def chosen(
         own = np.flatnonzero(group == label)
         rows = max(100, round(count * own_count / n)) + len(pairs)
         if len(own) <= rows:
-            found.append(own), factors.append(np.ones(len(own)))
+            found.append(own)
+            factors.append(np.ones(len(own)))
             continue
-        take = rng.permutation(len(own)) < CANDIDATES * rows
         states = rng.standard_normal((2, rows, root.shape[1]))
         states[1, ::2] = states[0, ::2]
         a, b = (root @ s.T for s in states)
@@ -63,7 +63,13 @@ def chosen(
         target = Y.sum(0)
         scale = 1 / np.sqrt((Y**2).sum(0) * len(own))
         scale[: len(pairs)] *= WEIGHT
+        # candidates by the energy they hold: what bends at a narrow foot bends nowhere else
+        share = np.linalg.norm(Y * scale, axis=1)
+        take = rng.choice(
+            len(own), min(CANDIDATES * rows, len(own)), replace=False, p=(share + share.mean()) / (2 * share.sum())
+        )
         solution, _ = nnls((Y[take] * scale).T, target * scale, maxiter=20 * rows)
         kept = solution > 0
-        found.append(own[take][kept]), factors.append(solution[kept])
+        found.append(own[take][kept])
+        factors.append(solution[kept])
     return np.concatenate(found), np.concatenate(factors)
