@@ -83,9 +83,7 @@ def write(rows: list[dict], said: list[str]) -> None:
     }
     text += [f"| mean | {' | '.join(cell(means[name]) for name in ROWS)} |", ""]
     text += ["## Motion: flow error, frequency [Hz], damping [1/s] of what was foretold and of what came", ""]
-    text += [
-        "| take | flow error, learned | image modes | frequency, learned | recorded | damping, learned | recorded |"
-    ]
+    text += ["| take | flow error, learned | image modes | frequency | recorded | damping | recorded |"]
     text += ["|---" * 7 + "|"]
     for take in takes:
         mine, image, real = (found[(*take, name)] for name in (LEARNED, IMAGE, REFERENCE))

@@ -54,7 +54,8 @@ class Foretell:
         before = material_of(self.world, self.world.estimate(), ready.reduced.zone)
         take, posed = ready.take, ready.take.posed
         assert posed is not None
-        scores, notes = {}, {}
+        scores: dict[str, dict[str, float | None]] = {}
+        notes: dict[str, str] = {}
         reference = None if take.at_rest else (posed - release) / take.fps
         pose: dict[str, np.ndarray | None] = {}
         seen = frames_seen(take)
