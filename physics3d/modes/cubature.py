@@ -14,7 +14,7 @@ Non-negative least squares leaves at most as many points as there are products. 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy import linalg
-from scipy.optimize import nnls
+from scipy.optimize import lsq_linear, nnls
 
 CANDIDATES = 5  # per point that is asked for
 WEIGHT = 10.0  # of the modes of vibration among the products
@@ -68,8 +68,18 @@ def chosen(
         take = rng.choice(
             len(own), min(CANDIDATES * rows, len(own)), replace=False, p=(share + share.mean()) / (2 * share.sum())
         )
-        solution, _ = nnls((Y[take] * scale).T, target * scale, maxiter=20 * rows)
+        solution = _not_negative((Y[take] * scale).T, target * scale)
         kept = solution > 0
         found.append(own[take][kept])
         factors.append(solution[kept])
     return np.concatenate(found), np.concatenate(factors)
+
+
+def _not_negative(A: Float[np.ndarray, "r c"], b: Float[np.ndarray, " r"]) -> Float[np.ndarray, " c"]:
+    """Least squares with x >= 0: active sets (Lawson and Hanson 1974), and where they go round in circles, as they may
+    when many columns are nearly the same, an interior method, whose smallest weights are none."""
+    try:
+        return nnls(A, b, maxiter=20 * len(b))[0]
+    except RuntimeError:
+        x = lsq_linear(A, b, bounds=(0, np.inf), tol=1e-10, max_iter=200).x
+        return np.where(x > 1e-6 * x.max(), x, 0.0)
