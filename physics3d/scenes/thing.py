@@ -62,6 +62,7 @@ class ThingSource(AbstractSource):
         """Raises ValueError for settings out of range, nothing to read, a clip that cannot be learned from (before
         anything is matched), photographs or a clip that cannot be placed; RuntimeError where there is no ffmpeg."""
         require_fields(self, "source")
+        self.files()  # what is missing is said before clips are read
         around, clips = self._around(), clip_files(self._clips())
         _require_unlike(clips)
         takes = filmed_takes(self._clips(), log=log, fps=self.fps)
@@ -182,8 +183,6 @@ def _seen(take: FilmedTake, posed: Posed, axes: Axes, fit: Fit, log, *, number: 
 
 def _straightened(video: torch.Tensor, lens: Lens, clip: str) -> torch.Tensor:
     """uint8 [t, h, w, 3], as the pinhole of `lens` would have seen it."""
-    if lens.pinhole(clip).fx == lens.fx:
-        return video
     frames = []
     for frame in video:
         ((straight, *_), _) = undistorted([frame.numpy().astype(np.float32)], lens, clip)
