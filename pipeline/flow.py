@@ -74,8 +74,8 @@ def left_out(config: dict[str, Any], capture: dict[str, Any], shelf: Path) -> di
         why["reconstruct"] = "the scene is a trained model already"
     if capture["single_object"]:
         why["segment"] = "the scene is a single object"
-    elif capture.get("moves") is not None:
-        why["segment"] = "the scene says what moves"
+    elif not capture.get("images", True):
+        why["segment"] = "the scene has no photographs, and says itself what moves"
     if "learn" not in roles:
         why.setdefault("learn", "the scene has no recorded motion to learn from")
     if not roles:
