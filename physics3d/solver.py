@@ -8,18 +8,20 @@ Both answer with the same Trajectory and are differentiable in the parameters, t
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from physics3d.boundaries.base import AbstractBoundary
+from physics3d.boundaries.impulse import Impulse
 from physics3d.log import Log
 from physics3d.materials.base import Values
 from physics3d.matter import Matter
 from physics3d.modes import rollout as modes
-from physics3d.modes.conditions import Refused, touched
+from physics3d.modes.conditions import WALLS, Refused, touched
+from physics3d.modes.dynamics import NotSolved
 from physics3d.mpm import rollout as grid
 from physics3d.trajectory import Trajectory
 from physics3d.world import World
@@ -38,6 +40,7 @@ class Motion:
     modes: modes.Solver | None  # None: the grid
     device: str
     log: Log
+    said: set[str] = field(default_factory=set)  # what was said already: a body is moved hundreds of times
 
     def __call__(
         self, parameters: Values, *, velocity: Tensor | None = None, frames: int, frame_dt: float, log: Log
@@ -45,18 +48,48 @@ class Motion:
         """Raises ValueError as `rollout` of the solver does."""
         timing: dict[str, Any] = dict(velocity=velocity, frames=frames, frame_dt=frame_dt, device=self.device, log=log)
         if self.modes is not None:
-            motion = self.modes.rollout(parameters, **timing)
-            walls = self.modes.model.conditions.walls
-            touch = touched(walls, motion.position.detach().cpu().double(), self.volume.cpu().double() ** (1 / 3) / 2)
-            if touch is None:
+            motion = self._by_modes(parameters, timing)
+            if motion is not None:
                 return motion
-            wall, frame = touch
-            what = f"the body reaches the {type(wall).__name__} in frame {frame}, which the modes do not feel"
-            if self.world.solver == "modes":
-                self.log.warn(f"{what}; take world.solver='grid' or 'auto'")
-                return motion
-            self.log.warn(f"{what}: the grid takes over")
         return grid.rollout(self.world, parameters, self.position, self.volume, excitation=self.excitation, **timing)
+
+    def report(self, parameters: Values) -> None:
+        """Say how the body vibrates with these parameters, if it is moved by its modes."""
+        if self.modes is None:
+            return
+        found = self.modes.modes(parameters)[:3]
+        self.log.info(f"first {len(found)} frequencies: {', '.join(str(mode) for mode in found)} Hz")
+        for number, mode in enumerate(found, 1):
+            self.log.metric(f"frequency/{number}", mode.frequency)
+            self.log.metric(f"loss_factor/{number}", mode.loss_factor)
+
+    def _by_modes(self, parameters: Values, timing: dict[str, Any]) -> Trajectory | None:
+        """None, and a word about it, where the grid has to do it."""
+        assert self.modes is not None
+        try:
+            motion = self.modes.rollout(parameters, **timing)
+        except NotSolved as reason:
+            if self.world.solver == "modes":
+                raise
+            self._say(f"{reason}: the grid takes over")
+            return None
+        touch = _touched(self.modes, self.volume, motion.position)
+        if touch is None:
+            return motion
+        wall, frame = touch
+        what = f"the body reaches the {type(wall).__name__} in frame {frame}, which the modes do not feel"
+        if self.world.solver == "modes":
+            self._say(f"{what}; take world.solver='grid' or 'auto'")
+            return motion
+        self._say(f"{what}: the grid takes over")
+        return None
+
+    def _say(self, what: str) -> None:
+        """Once: the same wall and the same remedy do not become truer by being repeated."""
+        kind = what.split(" in frame ")[0] if " in frame " in what else what.split(":")[0]
+        if kind not in self.said:
+            self.said.add(kind)
+            self.log.warn(what)
 
 
 def motion_of(
@@ -81,33 +114,55 @@ def motion_of(
     if world.solver != "grid":
         try:
             chosen = _modes(world, position, volume, excitation, part, matter, log)
+            if world.solver == "auto":
+                why = "the body touches nothing and comes back to its shape"
         except Refused as reason:
             why = str(reason)
             if world.solver == "modes":
                 raise ValueError(f"world.solver is 'modes', but {why}; take 'grid' or 'auto'") from None
-    if chosen is None:
-        log.info(f"solver: grid, for {why}")
-    else:
-        first = ", ".join(str(mode) for mode in chosen.modes(part(world.estimate().parameters))[:4])
-        log.info(f"solver: modes, for nothing touches the body and it recovers; its first frequencies: {first} Hz")
+    log.info(f"solver: {'grid' if chosen is None else 'modes'}, for {why}")
     return Motion(
         world=world, position=position, volume=volume, excitation=excitation, modes=chosen, device=device, log=log
     )
 
 
-def _modes(world, position, volume, excitation, part, matter, log) -> modes.Solver:
+def _modes(
+    world: World,
+    position: Tensor,
+    volume: Tensor,
+    excitation: tuple[AbstractBoundary, ...],
+    part: Callable[[Values], Values],
+    matter: Matter | None,
+    log: Log,
+) -> modes.Solver:
     """Raises Refused where the grid is needed."""
     if not world.material.recovers:
         raise Refused(f"the material ({type(world.material).__name__}) may flow")
     if len(position) > MOST_PIECES:
         raise Refused(f"{len(position)} particles are more than {MOST_PIECES}")
     start = part({name: torch.tensor(value, dtype=torch.float64) for name, value in world.start.items()})
+    _refuse_a_fall(world, excitation)
     found = modes.Solver.of(
         world, position, volume, excitation=excitation, part=start.get(modes.PART), matter=matter, log=log
     )
-    conditions = found.model.conditions
-    falls = any(world.gravity) or any(world.velocity)
-    if conditions.walls and falls and not conditions.held.any() and not conditions.grips:
-        names = ", ".join(type(wall).__name__ for wall in conditions.walls)
-        raise Refused(f"the body is held nowhere and falls towards its {names}")
+    touch = _touched(found, volume, position[None])
+    if touch is not None:
+        raise Refused(f"the body touches the {type(touch[0]).__name__} where it stands")
     return found
+
+
+def _refuse_a_fall(world: World, excitation: tuple[AbstractBoundary, ...]) -> None:
+    """Raises Refused, before anything is computed, where nothing holds a body that falls or flies towards a wall."""
+    every = (*world.boundaries, *excitation)
+    walls = [type(boundary).__name__ for boundary in every if isinstance(boundary, WALLS)]
+    holds = any(not isinstance(boundary, (*WALLS, Impulse)) for boundary in every)
+    if walls and not holds and (any(world.gravity) or any(world.velocity)):
+        raise Refused(f"the body is held nowhere and falls towards its {', '.join(walls)}")
+
+
+def _touched(solver: modes.Solver, volume: Tensor, position: Tensor) -> tuple[AbstractBoundary, int] | None:
+    """The first wall that matter which is not held reaches at `position` [t, p, 3] m, and in which frame."""
+    conditions = solver.model.conditions
+    free = torch.from_numpy(~conditions.held)
+    radius = volume.detach().cpu().double()[free] ** (1 / 3) / 2
+    return touched(conditions.walls, position.detach().cpu().double()[:, free], radius)

@@ -51,7 +51,7 @@ def plan(config: dict[str, Any], capture: Step, ask: bool = True) -> Plan:
     estimate = guess if "learn" in without else step("learn", capture, gaussians, body)
     trajectory = step("simulate", body, estimate)
     video = step("render", capture, gaussians, body, trajectory)
-    if "foretell" not in without:
+    if _unknown(peek(capture.folder)) and not {"foretell", "learn"} & set(without):
         step("foretell", capture, gaussians, body, estimate)
     if "evaluate" not in without:
         videos, estimates = {"learned": video}, {"learned": estimate}
@@ -74,22 +74,24 @@ def left_out(config: dict[str, Any], capture: dict[str, Any], shelf: Path) -> di
         why["reconstruct"] = "the scene is a trained model already"
     if capture["single_object"]:
         why["segment"] = "the scene is a single object"
-    elif capture.get("moves") is not None:
-        why["segment"] = "the scene says what moves"
+    elif not capture.get("images", True):
+        why["segment"] = "the scene has no photographs, and says itself what moves"
     if "learn" not in roles:
         why.setdefault("learn", "the scene has no recorded motion to learn from")
-    unknown = any(take["role"] == "learn" and take["excitation"] is None for take in capture["takes"])
     if not roles:
         why["evaluate"] = "the scene has no recorded motion to compare with"
-    if unknown:
+    if _unknown(capture):
         why["evaluate"] = "nobody knows what set the recorded motion going: it is foretold instead"
-    else:
-        why["foretell"] = "what set the recorded motion going is known" if roles else why["evaluate"]
     for name in why:
         usual = usual_seconds(shelf, name)
         if usual is not None:
             why[name] += f"; it took {usual:.0f} s in other runs here"
     return why
+
+
+def _unknown(capture: dict[str, Any]) -> bool:
+    """Whether nobody knows what set the motion going that is learned from."""
+    return any(take["role"] == "learn" and take.get("excitation", ()) is None for take in capture["takes"])
 
 
 def up_to_date(config: dict[str, Any], shelf: Path, verify: bool) -> Plan | None:

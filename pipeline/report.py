@@ -55,8 +55,10 @@ def report(plan: Plan, hits: dict[str, bool]) -> dict[str, float]:
         parameters.add_row(name, *row)
     console.print(parameters)
 
-    if "evaluate" in steps:
-        stored = peek(steps["evaluate"].folder)
+    for judge in ("foretell", "evaluate"):
+        if judge not in steps:
+            continue
+        stored = peek(steps[judge].folder)
         metrics = list(dict.fromkeys(m for row in stored["values"].values() for m in row))
         scores = table("score", *metrics)
         for name, row in stored["values"].items():

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 FRAMES, FPS = 90, 30.0  # of each clip: three seconds
-SIZE = {"width": 640, "height": 480}  # [px]: structure from motion needs detail
+WIDTH, HEIGHT = 640, 480  # [px]: structure from motion needs detail
 PUSH = 0.15  # how long it is pushed, from the first frame [s]
 
 
@@ -28,7 +28,7 @@ def main(environment: Mapping[str, str]) -> int:
     if folder.exists():
         print(f"error: {folder} exists already; remove it, or say OUT=<another folder>", file=sys.stderr)
         return 1
-    twin = CarnationTwin(views=40, frames=FRAMES, fps=FPS, push=PUSH, points=500, **SIZE)
+    twin = CarnationTwin(views=40, frames=FRAMES, fps=FPS, push=PUSH, points=500, width=WIDTH, height=HEIGHT)
     try:
         with tempfile.TemporaryDirectory(prefix="physics3d_") as notes:
             thing = hand_over(twin(log=Log(Path(notes), name="twin")), folder, density=twin.density)

@@ -21,7 +21,7 @@ from physics3d.learning.foretold import foretold
 from physics3d.learning.free_body import material_of
 from physics3d.learning.free_motion import Material, start
 from physics3d.learning.seen_modes import observe
-from physics3d.learning.unknown_cause import Swung, first_take, frames_seen, swung
+from physics3d.learning.unknown_cause import Swung, by_its_own_camera, first_take, frames_seen, swung
 from physics3d.log import Log
 from physics3d.metrics.against import Reference
 from physics3d.metrics.image import psnr_per_frame, ssim_per_frame
@@ -54,7 +54,8 @@ class Foretell:
         before = material_of(self.world, self.world.estimate(), ready.reduced.zone)
         take, posed = ready.take, ready.take.posed
         assert posed is not None
-        scores, notes = {}, {}
+        scores: dict[str, dict[str, float | None]] = {}
+        notes: dict[str, str] = {}
         reference = None if take.at_rest else (posed - release) / take.fps
         pose: dict[str, np.ndarray | None] = {}
         seen = frames_seen(take)
@@ -67,7 +68,8 @@ class Foretell:
         scores |= self.judged(ready, take, motions, flow[-1], release=release, seen=seen, notes=notes, log=log)
         for other in capture.takes:
             if other is not take:
-                scores |= self.other(ready, other, {LEARNED: learned, START: before}, pose, notes, log)
+                own = ready if other.posed is None else by_its_own_camera(ready, other, gaussians, body)
+                scores |= self.other(own, other, {LEARNED: learned, START: before}, pose, notes, log)
         table = Scores(values=scores, notes=notes)
         table.check()
         for row, cells in scores.items():
@@ -95,7 +97,13 @@ class Foretell:
             return {}
         clip, flow = observe(ready.sight, frames[:seen], take.fps, reference=ready.picture)
         motions = {
-            name: start(ready.reduced, material, clip.window(release, seen), since=0.0, known=pose[name])[0]
+            name: start(
+                ready.reduced,
+                material,
+                clip.window(release, seen),
+                since=0.0,
+                known=None if take.at_rest else pose[name],
+            )[0]
             for name, material in materials.items()
         }
         return self.judged(ready, take, motions, flow[-1], release=release, seen=seen, notes=notes, log=log)

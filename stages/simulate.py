@@ -57,6 +57,7 @@ class Simulate:
                 log=log,
             )
             parameters = part(estimate.parameters)
+            motion.report(parameters)
             trajectory = motion(
                 parameters, velocity=estimate.velocity, frames=self.frames, frame_dt=1 / self.fps, log=log
             )

@@ -175,7 +175,12 @@ def mentioned() -> list[str]:
     return sorted(w for w in words if not re.search(modules, w))
 
 
-SCENE_OF = {"camera_distance": "photos", "prompts.0.view": "photos", "boundaries.0.point": "trained"}
+SCENE_OF = {
+    "scene.camera_distance": "clip",
+    "camera_distance": "photos",
+    "prompts.0.view": "photos",
+    "boundaries.0.point": "trained",
+}
 PRIOR_OF = {"prior.prompt": "modelscope", "prior.time": "modelscope"}
 
 

@@ -85,6 +85,9 @@ def _say_held(body: Body, world: World, setting: Setting, log: Log) -> None:
     section = thinnest_section(position, volume, np.asarray(held), body.spacing)
     if section is None:
         return
+    if world.solver != "grid":  # modes integrate every section with its second moment, whatever the particles
+        log.info(f"on a grid: {section.described(world.dx)}")
+        return
     log.metric("held_section_cells", section.cells(world.dx))
     if section.cells(world.dx) < 0.99 * COARSE:  # a section of two cells is two, whatever the rounding
         log.warn(f"{section.described(world.dx)}; take scene.dx <= {section.thickness / COARSE:.2g} m for better")

@@ -63,6 +63,7 @@ def chain_of(
         device=device,
         log=log,
     )
+    motion.report(part(field.parameters(field.zero())))
 
     def simulate(theta: Tensor):
         timing = dict(frames=at[-1] + 1, frame_dt=step / take.fps, log=Log(None))

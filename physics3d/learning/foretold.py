@@ -35,7 +35,7 @@ def foretold(
     y, x = np.mgrid[: back.shape[0], : back.shape[1]].astype(np.float32)
     here, picture, frames = motion.at(last), photograph.numpy(), []
     for t in times:
-        v = sight.displacement(motion.at(float(t)) - here).astype(np.float32)
-        v = cv2.remap(v, x + back[..., 0], y + back[..., 1], cv2.INTER_LINEAR)
+        u = sight.displacement(motion.at(float(t)) - here).astype(np.float32)
+        v = cv2.remap(u, x + back[..., 0], y + back[..., 1], cv2.INTER_LINEAR)
         frames.append(torch.from_numpy(carried(picture, cv2.GaussianBlur(v, (0, 0), SMOOTH))))
     return torch.stack(frames)

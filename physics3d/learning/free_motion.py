@@ -220,6 +220,8 @@ def fit(
         )
         if asked:
             theta = finer.x
+    # told one way: zones are zero in the mean
+    theta[0], theta[3:] = theta[0] + theta[3:].mean(), theta[3:] - theta[3:].mean()
     material = Material.of(theta)
     return material, start(body, material, window, since=0.0, reference=at)[0]
 

@@ -102,8 +102,8 @@ def sight(gaussians: Gaussians, body: Body, camera: Camera, basis: Float[np.ndar
         ],
         1,
     )
-    seen = (seen @ camera.world_to_camera[:3, :3].double()).numpy()
-    jacobian = np.einsum("nr,nci->ncri", values, seen).reshape(len(pixel), 2, -1)
+    slope = (seen @ camera.world_to_camera[:3, :3].double()).numpy()
+    jacobian = np.einsum("nr,nci->ncri", values, slope).reshape(len(pixel), 2, -1)
     return Sight(thing=thing, pixel=pixel, jacobian=jacobian)
 
 

@@ -1,6 +1,6 @@
 """A take whose cause nobody knows: what its camera sees of the body, and the material that makes it swing so."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -56,6 +56,13 @@ def swung(world: World, capture: Capture, gaussians: Gaussians, body: Body, *, z
         picture=take.videos[0][take.posed],
         take=take,
     )
+
+
+def by_its_own_camera(body: Swung, take: Take, gaussians: Gaussians, rides: Body) -> Swung:
+    """Another take, whose camera and picture of the thing at rest are its own."""
+    assert take.posed is not None
+    seen = sight(gaussians, rides, take.cameras[0], body.model.values)
+    return replace(body, sight=seen, picture=take.videos[0][take.posed], take=take)
 
 
 def first_take(body: Swung, log: Log) -> tuple[Observed, Float[np.ndarray, "t h w 2"], Decay, int]:

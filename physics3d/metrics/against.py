@@ -5,7 +5,7 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from physics3d.metrics.image import ms_ssim, psnr, ssim
-from physics3d.metrics.motion import flow_error, motion_psnr, oscillation, phase_error, signal
+from physics3d.metrics.motion import Oscillation, flow_error, motion_psnr, oscillation, phase_error, signal
 from physics3d.metrics.video import vmaf
 from physics3d.motion.flow import flow
 from physics3d.motion.shapes import moving
@@ -21,7 +21,10 @@ class Reference:
         self.clip, self.fps = clip, fps
         self.u = flow(clip)
         self.where = moving(self.u)
-        self.swing, self.why = (None, STILL) if self.where is None else self._swing(self.u)
+        self.swing: Oscillation | None = None
+        self.why = STILL
+        if self.where is not None:
+            self.swing, self.why = self._swing(self.u)
 
     def itself(self) -> tuple[Cells, str]:
         """Frequency and damping of the reference, and why it has no oscillation if so."""
@@ -46,7 +49,7 @@ class Reference:
         found, why = self._swing(u)
         return cells | self._cells(found, ""), why
 
-    def _swing(self, u: np.ndarray):
+    def _swing(self, u: np.ndarray) -> tuple[Oscillation | None, str]:
         assert self.where is not None
         return oscillation(signal(u, self.u, self.where), self.fps)
 

@@ -74,7 +74,7 @@ class Conditions:
     held: np.ndarray  # [p] bool: particles that never move
     loads: tuple[Load, ...]
     grips: tuple[Grip, ...]
-    walls: tuple[AbstractBoundary, ...]
+    walls: tuple[HalfSpace | BoundingBox, ...]
 
 
 def conditions(boundaries: Sequence[AbstractBoundary], setting: Setting, matter: Matter) -> Conditions:
@@ -128,10 +128,9 @@ def conditions(boundaries: Sequence[AbstractBoundary], setting: Setting, matter:
         return rest
 
     for lower, upper in boxes:
-        before = len(matter.position)
         matter = take(outside_box(matter, lower, upper))
-        if before == len(matter.position) and not len(pins[-1]):
-            raise Refused(f"FixedRegion from {lower} to {upper} m holds no part of the body; move or enlarge it")
+        if not len(pins[-1]):
+            raise Refused(f"FixedRegion from {lower} to {upper} m holds nothing that the body hangs on; enlarge it")
     for mask in held_particles:
         matter = take(outside_particles(matter, mask))
     if not len(matter.position):
@@ -145,7 +144,7 @@ def conditions(boundaries: Sequence[AbstractBoundary], setting: Setting, matter:
 
 
 def touched(
-    walls: Sequence[AbstractBoundary], position: Float[Tensor, "t p 3"], radius: Float[Tensor, " p"]
+    walls: Sequence[HalfSpace | BoundingBox], position: Float[Tensor, "t p 3"], radius: Float[Tensor, " p"]
 ) -> tuple[AbstractBoundary, int] | None:
     """The first wall that particles at `position` [m], half the edge of a cube large, reach, and in which frame."""
     first = None

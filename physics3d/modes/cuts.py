@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from physics3d.matter import Matter
 
@@ -23,6 +23,11 @@ class Pins:
 
     def __len__(self) -> int:
         return len(self.area)
+
+    def and_more(self, other: "Pins") -> "Pins":
+        """Both, on the pieces of the same body."""
+        both = lambda name: np.concatenate([getattr(self, name), getattr(other, name)])
+        return Pins(position=both("position"), area=both("area"), piece=both("piece"))
 
     def renumbered(self, keep: np.ndarray) -> "Pins":
         """Those on the pieces of a mask, numbered among these."""
@@ -71,17 +76,26 @@ def outside_box(matter: Matter, lower: tuple, upper: tuple) -> tuple[Matter, Pin
         keep
     )
     pins = Pins(position=pin.reshape(-1, 3), area=np.repeat(area, 4), piece=np.repeat(number[chosen], 4))
-    return cut, pins, keep
+    # where the face runs between two pieces and cuts neither
+    cut_already = np.zeros(len(keep), bool)
+    cut_already[chosen] = True
+    return cut, pins.and_more(_between(matter, keep, cut_already)), keep
 
 
 def outside_particles(matter: Matter, held: np.ndarray) -> tuple[Matter, Pins, np.ndarray]:
-    """The matter of the particles that are not in the mask `held` [p], pins in the middle of each link across, and the
+    """The matter of the particles that are not in the mask `held` [p], pins where it touches the rest, and the
     mask of the pieces that are kept."""
-    mine = held[matter.owner.numpy()]
+    keep = ~held[matter.owner.numpy()]
+    return matter.select(keep), _between(matter, keep, np.zeros(len(keep), bool)), keep
+
+
+def _between(matter: Matter, keep: Bool[np.ndarray, " m"], pinned: Bool[np.ndarray, " m"]) -> Pins:
+    """Four pins on each face that a piece which is kept, and not `pinned` yet, turns to one that is not kept."""
     links = matter.links.numpy()
-    across = links[mine[links[:, 0]] != mine[links[:, 1]]]
-    free = np.where(mine[across[:, 0]], across[:, 1], across[:, 0])
+    across = links[keep[links[:, 0]] != keep[links[:, 1]]]
+    free = np.where(keep[across[:, 0]], across[:, 0], across[:, 1])
     fixed = across.sum(1) - free
+    free, fixed = free[~pinned[free]], fixed[~pinned[free]]
     x, S = matter.position.numpy(), matter.moment.numpy()
     normal = x[free] - x[fixed]
     distance = np.linalg.norm(normal, axis=1)
@@ -92,9 +106,10 @@ def outside_particles(matter: Matter, held: np.ndarray) -> tuple[Matter, Pins, n
     tangent = np.linalg.svd(normal[:, None])[2][:, 1:]  # [k, 2, 3]
     wide = np.sqrt(np.einsum("kti,kij,ktj->kt", tangent, S[free], tangent))
     signs = np.array([(1, 1), (1, -1), (-1, 1), (-1, -1)], float)
-    middle = (x[free] + x[fixed]) / 2
-    pin = middle[:, None] + np.einsum("st,kt,kti->ksi", signs, wide, tangent)
-    area = matter.volume.numpy()[free] / (2 * np.sqrt(3 * np.einsum("ki,kij,kj->k", normal, S[free], normal)))
-    number = np.cumsum(~mine) - 1
-    pins = Pins(position=pin.reshape(-1, 3), area=np.repeat(area / 4, 4), piece=np.repeat(number[free], 4))
-    return matter.select(~mine), pins, ~mine
+    half = np.sqrt(3 * np.einsum("ki,kij,kj->k", normal, S[free], normal))
+    # on the face of what is free: in a gap before it, nothing would keep the splines from a kink
+    face = x[free] - np.minimum(half, distance)[:, None] * normal
+    pin = face[:, None] + np.einsum("st,kt,kti->ksi", signs, wide, tangent)
+    area = matter.volume.numpy()[free] / (2 * half)
+    number = np.cumsum(keep) - 1
+    return Pins(position=pin.reshape(-1, 3), area=np.repeat(area / 4, 4), piece=np.repeat(number[free], 4))

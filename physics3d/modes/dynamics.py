@@ -35,8 +35,21 @@ SLOW = 0.5  # an error that falls by less asks for a new matrix
 SHORTEST = 1e-3  # share of a Newton step
 
 
-class NotSolved(Exception):
+class NotSolved(ValueError):
     """Newton's method found no end of this step."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pull:
+    """What a spring does at rest of the body, for a target that moves rigidly: X + (R - I) (X - point) + d."""
+
+    motion: Callable[[float], tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]]  # R - I [1], d [m] at a time
+    first: Float[np.ndarray, "r 4"]  # int k s_j (1, X - point) [N/m], [N]
+
+    def __call__(self, t: float) -> Float[np.ndarray, "r 3"]:
+        """Force [N] at a time [s]: the matrix of the spring times the displacement of the target."""
+        turn, way = self.motion(t)
+        return self.first[:, :1] * way + self.first[:, 1:] @ turn.T
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +57,7 @@ class Spring:
     """Holds part of the body at a target while it is on; `matrix` [r, r] N/m, of each component."""
 
     matrix: np.ndarray | sparse.csr_matrix  # [r, r] [N/m]
-    pull: Callable[[float], Float[np.ndarray, "r 3"]] | None = None  # matrix times the target at a time [N]; None: rest
+    pull: Pull | None = None  # None: the target is at rest
     until: float = np.inf  # [s]
 
 
@@ -114,9 +127,9 @@ class System:
         self._back = self.gradient.T.copy()
 
     def run(
-        self, q: np.ndarray, v: np.ndarray, loads: np.ndarray, plan: Sequence[Sequence[Step]], keep: list | None
+        self, q: np.ndarray, v: np.ndarray, loads: np.ndarray, plan: Sequence[Step], keep: list | None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """(q, v) [r, 3] after every list of steps in the plan, under loads [b, r, 3] N. With `keep`, a list, what
+        """(q, v) [r, 3] after the steps of the plan, under loads [b, r, 3] N. With `keep`, a list, what
         the reverse pass needs is put there. Raises NotSolved; the state is then that of the start."""
         begin = self.points.state(), self.since
         try:
@@ -180,8 +193,8 @@ class System:
             self._refresh(q, after, (inertial, self._held(q, t)[1]))
             x = self._solve(q, residual, inertial, after, t)
         self._past = [*self._past[-2:], (dt, x)]
-        if keep is not None:
-            keep.append(_Taken(step, after, x, before, self._matrix))
+        if keep is not None and before is not None:
+            keep.append(_Taken(step, after, x, before, self._factored))
         self.points.keep()
         self.since = dt / 2
         return 2 * x - q, (4 / dt) * (x - q) - v
@@ -241,7 +254,7 @@ class System:
         Broyden's update by the steps so far (Kelley 1995, sec. 7.3), in the inner product of A."""
         if not np.isfinite(r).all():
             return _Way(r, r), np.inf
-        way, force = self._matrix.solve(r), r
+        way, force = self._factored.solve(r), r
         error = float(np.sqrt(abs(np.vdot(way, r))))
         for s, after in itertools.pairwise(steps):
             share = np.vdot(s.force, way) / s.size
@@ -250,6 +263,11 @@ class System:
             factor = 1 / (1 - np.vdot(steps[-1].force, way) / steps[-1].size)
             way, force = factor * way, factor * force
         return _Way(way, force), error
+
+    @property
+    def _factored(self) -> _Matrix:
+        assert self._matrix is not None, "no step has begun"
+        return self._matrix
 
     def _refresh(self, x, after: float, which: tuple) -> None:
         D = self.points.tangent((self.gradient @ x).reshape(-1, 3, 3), after)

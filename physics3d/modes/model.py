@@ -8,7 +8,7 @@ Built once, with the parameters that the world starts from; a learned material m
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -21,16 +21,18 @@ from physics3d.materials.base import Values
 from physics3d.matter import Matter, in_one_piece, of_particles, points
 from physics3d.modes import basis, cubature, lattice, vibration
 from physics3d.modes.conditions import Conditions, Refused, conditions
-from physics3d.modes.dynamics import TOLERANCE, Spring, System
+from physics3d.modes.dynamics import TOLERANCE, Pull, Spring, System
 from physics3d.modes.stress import Points
 from physics3d.world import World
 
-CELL = (2, 3, 4, 6, 8)  # spacing of the splines, in edges of a piece: the first with at most MOST_SPLINES of them
+# spacing of the splines, in edges of a piece: the first with at most MOST_SPLINES of them
+CELL = (1, 1.5, 2, 3, 4, 6, 8)
 MOST_SPLINES = 1500
 PIN = 1e3  # stiffness of a pin, in that of a cube of the piece behind it
 MODES = 12  # of vibration, whose components are fields of the basis
-QUADRATURE = 500  # points of integration
+QUADRATURE = 300  # points of integration
 SMOOTH = 30.0  # times the highest mode: what would swing faster is smoothed out of a start
+RIGID = 1e-3  # of the highest mode: what swings slower is a rigid motion of a free body
 MOST_GROUPS = 8  # materials that differ; more are a field
 
 
@@ -84,19 +86,20 @@ class Model:
             tolerance=TOLERANCE[self.world.dtype],
         )
 
-    def at_points(self, coefficients: Tensor) -> Tensor:
-        """Coefficients [k, 1 or p] of the particles -> [k, n] of the points."""
-        return coefficients.expand(-1, len(self.values_rows))[:, torch.from_numpy(self.owner)]
-
-    @property
-    def values_rows(self) -> range:
-        return range(self.values.shape[0])
-
     def modes(self, coefficients: np.ndarray) -> list[vibration.Mode]:
-        """Frequencies and loss factors of the modes of vibration, their shapes those of the stuck dash-pots."""
-        strain = np.stack([(self.gradient @ shape).reshape(-1, 3, 3) for shape in self.shapes])
+        """Frequencies and loss factors of the modes of vibration, their shapes those of this material with stuck
+        dash-pots."""
+        points = Points(self.world.material, coefficients, self.weight)
+        stuck = points.tangent(np.zeros((len(self.weight), 3, 3)), vibration.STUCK)
+        held_by = sum((np.kron(s.matrix, np.eye(3)) for s in self.springs if s.pull is None), 0 * self.stiffness)
+        whole = vibration.stiffness(self.gradient, stuck) + held_by
+        mass, faint = np.kron(self.mass, np.eye(3)), 1e-6 * self.omega.max() ** 2
+        square, found = vibration.dense_modes(whole, mass, len(self.omega), shift=faint)
+        swings = square > (RIGID * np.sqrt(square.max())) ** 2
+        shapes = found.T.reshape(len(square), -1, 3)[swings]
+        strain = np.stack([(self.gradient @ shape).reshape(-1, 3, 3) for shape in shapes])
         kappa = vibration.relaxation(self.world.material, coefficients, self.weight, strain)
-        held = np.array([sum(np.vdot(s, k.matrix @ s) for k in self.springs if k.pull is None) for s in self.shapes])
+        held = np.array([sum(np.vdot(s, k.matrix @ s) for k in self.springs if k.pull is None) for s in shapes])
         return vibration.damped(lambda t: kappa(t) + held)
 
 
@@ -116,8 +119,8 @@ def model(
     better. `parameters` are those whose modes of vibration the basis is made of. Raises Refused (a ValueError) where
     a boundary needs the grid."""
     x, V = position.detach().cpu().double(), volume.detach().cpu().double()
-    corner = x.amin(0).tolist(), x.amax(0).tolist()
-    setting = Setting(position=x, mass=world.density * V, volume=V, lower=corner[0], upper=corner[1], dx=world.dx)
+    lower, upper = ((float(a), float(b), float(c)) for a, b, c in (x.amin(0), x.amax(0)))
+    setting = Setting(position=x, mass=world.density * V, volume=V, lower=lower, upper=upper, dx=world.dx)
     if matter is None:
         matter = of_particles(x, V)
     found = conditions(boundaries, setting, in_one_piece(matter))
@@ -137,8 +140,8 @@ def model(
     N, G = splines.at(at, piece)
     owner = matter.owner.numpy()[piece]
 
-    coefficients = world.material.coefficients({k: torch.as_tensor(v).double() for k, v in parameters.items()})
-    coefficients = coefficients.detach().cpu().expand(-1, len(x)).numpy()[:, owner]
+    of_all = world.material.coefficients({k: torch.as_tensor(v).double() for k, v in parameters.items()})
+    coefficients = of_all.detach().cpu().expand(-1, len(x)).numpy()[:, owner]
     modulus = world.material.wave_modulus(torch.from_numpy(coefficients)).numpy()
     stuck = Points(world.material, coefficients, weight)
     K = vibration.stiffness(G, stuck.tangent(np.zeros((len(weight), 3, 3)), vibration.STUCK))
@@ -162,7 +165,7 @@ def model(
         k = np.where(mine, PIN * modulus * weight / size**2, 0.0)
         matrix = N.T @ sparse.diags(k) @ N
         first = np.stack([N.T @ k, *(N.T @ (k * (at[:, a] - grip.point[a])) for a in range(3))], 1)
-        springs.append(Spring(matrix=matrix.tocsr(), pull=_pull(grip, first), until=grip.until))
+        springs.append(Spring(matrix=matrix.tocsr(), pull=Pull(motion=grip.motion, first=first), until=grip.until))
     load_weight = np.array([load.weight[owner] for load in found.loads]).reshape(-1, len(owner))
     load_fields = (N.T @ (world.density * weight * load_weight).T).T
     first_moment = N.T @ (world.density * weight)
@@ -236,19 +239,8 @@ def model(
     )
 
 
-class _pull:
-    """matrix times the target of a grip: `first` are int k s_j (1, X - point)."""
-
-    def __init__(self, grip, first: np.ndarray):
-        self.grip, self.first = grip, first
-
-    def __call__(self, t: float) -> np.ndarray:
-        turn, way = self.grip.motion(t)
-        return self.first[:, :1] * way + self.first[:, 1:] @ turn.T
-
-
 def _in_basis(spring: Spring, C: np.ndarray) -> Spring:
-    pull = None if spring.pull is None else _pull(spring.pull.grip, C.T @ spring.pull.first)
+    pull = None if spring.pull is None else replace(spring.pull, first=C.T @ spring.pull.first)
     return Spring(matrix=C.T @ (spring.matrix @ C), pull=pull, until=spring.until)
 
 

@@ -110,7 +110,7 @@ class Solver:
         return found.expand(-1, len(self.position))[:, torch.from_numpy(self.model.owner)]
 
     def modes(self, parameters: Values) -> list[Mode]:
-        """The lowest modes of vibration about the undeformed state."""
+        """The lowest modes of vibration about the undeformed state, rigid motions of a free body left out."""
         return self.model.modes(self.coefficients(parameters).detach().numpy())
 
     def statics(
@@ -129,7 +129,7 @@ class Solver:
         try:
             return torch.from_numpy(body.values @ system.statics(np.zeros_like(total), total))
         except NotSolved as reason:
-            raise ValueError(f"no equilibrium was found: {reason}; take a weaker force or a stiffer material") from None
+            raise NotSolved(f"no equilibrium was found: {reason}; take a weaker force or a stiffer material") from None
 
     def rollout(
         self,
@@ -249,7 +249,7 @@ class _Run:
                 break
             except NotSolved as reason:
                 if tried == TRIES or 2 * count > world.max_substeps or world.dt is not None:
-                    raise ValueError(
+                    raise NotSolved(
                         f"frame {frame}: {reason} with steps of {self.frame_dt / count:g} s; take a weaker force, a "
                         "slower start, a smaller world.dt or world.solver='grid'"
                     ) from None

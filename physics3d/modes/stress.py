@@ -9,14 +9,13 @@ so that F is that of the basis itself and never drifts. All arrays are float64 a
 row a is the derivative along axis a, as the gradients of the basis are laid out.
 """
 
-import functools
-
 import numpy as np
 import torch
 import warp as wp
 from jaxtyping import Float
 
 from physics3d.materials.base import AbstractMaterial
+from physics3d.modes.kernels import stages
 from physics3d.warp_start import start_warp
 
 
@@ -41,15 +40,16 @@ class Points:
         self._arrays = {name: _array(value) for name, value in self.data.items()}
         self._adjoints = {name: _array(value) for name, value in self.adjoint.items()}
         self.data["memory"][:] = material.initial_memory(n, torch.float64).numpy()
-        self._kernels = _kernels(material.advance(wp.float64))
-        # recorded once: a launch of few points is all overhead
+        self._kernels = stages(material.advance(wp.float64))
+        # recorded once per dt: a launch of few points is half overhead
         self._forward: dict[float, list] = {}
+        self._backward: dict[float, list] = {}
 
     def stress(self, Ht: Float[np.ndarray, "n 3 3"], dt: float) -> Float[np.ndarray, "n 3 3"]:
         """w P transposed, of the deformation Ht [n, 3, 3] a time dt [s] after the last one that was kept."""
         np.copyto(self.data["H"], Ht)
         if dt not in self._forward:
-            self._forward = {dt: [self._launch(i, dt, record_cmd=True) for i in range(3)]}
+            self._forward = {dt: [self._recorded(i, dt) for i in range(3)]}
         for command in self._forward[dt]:
             command.launch()
         return self.data["P"]
@@ -78,8 +78,10 @@ class Points:
             np.copyto(self.adjoint["P"], P_bar)
         if memory_bar is not None:
             np.copyto(self.adjoint["memory_next"], memory_bar)
-        for i in (2, 1, 0):
-            self._launch(i, dt, adjoint=True)
+        if dt not in self._backward:
+            self._backward = {dt: [self._recorded(i, dt, adjoint=True) for i in (2, 1, 0)]}
+        for command in self._backward[dt]:
+            command.launch()
         return self.adjoint
 
     def tangent(self, Ht: Float[np.ndarray, "n 3 3"], dt: float) -> Float[np.ndarray, "9 n 3 3"]:
@@ -98,7 +100,7 @@ class Points:
         coefficients, memory = (torch.from_numpy(self.data[name]) for name in ("coefficients", "memory"))
         return float(self.material.energy(coefficients, H, memory).numpy() @ self.data["weight"])
 
-    def _launch(self, stage: int, dt: float, *, adjoint: bool = False, record_cmd: bool = False):
+    def _recorded(self, stage: int, dt: float, *, adjoint: bool = False) -> wp.Launch:
         kernel, inputs, outputs = self._kernels[stage]
         pick = lambda names, table: [table[name] for name in names]
         return wp.launch(
@@ -109,7 +111,7 @@ class Points:
             adj_inputs=[None, *pick(inputs, self._adjoints)] if adjoint else [],
             adj_outputs=pick(outputs, self._adjoints) if adjoint else [],
             adjoint=adjoint,
-            record_cmd=record_cmd,
+            record_cmd=True,
             device="cpu",
         )
 
@@ -118,62 +120,3 @@ def _array(value: np.ndarray) -> wp.array:
     """The same memory, for Warp."""
     kind = wp.mat33d if value.shape[1:] == (3, 3) else wp.float64
     return wp.array(value, dtype=kind, copy=False, device="cpu")
-
-
-@functools.cache
-def _kernels(function: wp.Function) -> tuple[tuple[wp.Kernel, tuple[str, ...], tuple[str, ...]], ...]:
-    """(kernel, its inputs after dt, its outputs) of the three stages: one each, so that the adjoint of the constitutive
-    function does not evaluate it again."""
-
-    @wp.kernel(module="unique", enable_backward=True)
-    def material_points(
-        # in
-        dt: wp.float64,  # [s]
-        L: wp.array(dtype=wp.mat33d),  # velocity gradient [1/s]
-        H_0: wp.array(dtype=wp.mat33d),  # [n] F - I transposed, at the start [1]
-        coefficients: wp.array2d(dtype=wp.float64),  # [k, n] of the material
-        memory: wp.array2d(dtype=wp.float64),  # [m, n] internal variables
-        # out
-        H_next: wp.array(dtype=wp.mat33d),  # [n] [1]
-        tau: wp.array(dtype=wp.mat33d),  # [Pa]
-        memory_next: wp.array2d(dtype=wp.float64),  # [m, n]
-    ):
-        p = wp.tid()
-        H_p, tau_p = function(p, dt, L[p], wp.transpose(H_0[p]), coefficients, memory, memory_next)
-        H_next[p] = H_p
-        tau[p] = tau_p
-
-    return (
-        (_rate, ("H", "H_0"), ("L",)),
-        (material_points, ("L", "H_0", "coefficients", "memory"), ("H_next", "tau", "memory_next")),
-        (_force, ("tau", "H", "weight"), ("P",)),
-    )
-
-
-@wp.kernel
-def _rate(
-    # in
-    dt: wp.float64,  # [s]
-    H: wp.array(dtype=wp.mat33d),  # [n] F - I transposed [1]
-    H_0: wp.array(dtype=wp.mat33d),  # [n] F - I transposed, at the start [1]
-    # out
-    L: wp.array(dtype=wp.mat33d),  # [1/s]
-):
-    p = wp.tid()
-    one = wp.identity(n=3, dtype=wp.float64)
-    L[p] = wp.transpose(wp.inverse(one + H_0[p]) * (H[p] - H_0[p])) / dt
-
-
-@wp.kernel
-def _force(
-    # in
-    dt: wp.float64,  # [s]
-    tau: wp.array(dtype=wp.mat33d),  # [Pa]
-    H: wp.array(dtype=wp.mat33d),  # [n] F - I transposed [1]
-    weight: wp.array(dtype=wp.float64),  # [m^3]
-    # out
-    P: wp.array(dtype=wp.mat33d),  # transposed [J]
-):
-    p = wp.tid()
-    one = wp.identity(n=3, dtype=wp.float64)
-    P[p] = weight[p] * (wp.transpose(wp.inverse(one + H[p])) * tau[p])

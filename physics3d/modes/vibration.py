@@ -119,11 +119,25 @@ def relaxation(
     """kappa(t) of fields of small strain [m, n, 3, 3] (transposed gradients): work per square of the amplitude, a time
     t after it was applied."""
 
+    points, still = Points(material, coefficients, weight), np.zeros((len(weight), 3, 3))
+    rest = points.state()
+    points.stress(still, STUCK)
+    points.keep()
+    strained = points.state()
+
     def after(t: float) -> np.ndarray:
-        # a step takes its stress from the half-relaxed strain
-        D = Points(material, coefficients, weight).tangent(np.zeros((len(weight), 3, 3)), 2 * t)
-        D = D.reshape(3, 3, len(weight), 3, 3)
-        return np.einsum("mnai,ainbk,mnbk->m", strain, D, strain, optimize=True)
+        points.set_state(strained)
+        points.stress(still, t)  # held
+        found, memories = np.zeros(len(strain)), []
+        for m, own in enumerate(strain):
+            pulled = points.pull(own, None, t)
+            found[m] = np.vdot(pulled["H"] + pulled["H_0"], own)
+            memories.append(pulled["memory"].copy())
+        points.set_state(rest)
+        points.stress(still, STUCK)  # applied
+        for m, own in enumerate(strain):
+            found[m] += np.vdot(points.pull(None, memories[m], STUCK)["H"], own)
+        return found
 
     return after
 

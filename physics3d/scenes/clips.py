@@ -49,6 +49,8 @@ class FilmedTake:
             videos=(self.video,),
             excitation=None,
             release=self.release,
+            posed=self.rest,
+            at_rest=True,
         )
 
 

@@ -10,6 +10,9 @@ It fixes neither the unit of length, nor where up is, nor the origin; `upright` 
     origin  = the point nearest to all optical axes, dropped onto the floor (z = 0) where there is one
     scale   = camera distance / median distance of the cameras from that point                        [m per unit]
 
+Stills of clips can be placed among the photographs. They have a lens of their own, are compared with every photograph
+and not with each other (a stand gives no parallax), and neither up, origin nor scale follows from them.
+
 Schönberger and Frahm (2016); pycolmap is an optional extra.
 """
 
@@ -17,7 +20,8 @@ import contextlib
 import signal
 import sqlite3
 import threading
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +41,14 @@ PAIRS_ASKED = 40  # pairs of photographs of which that is asked
 
 
 @dataclass(frozen=True, kw_only=True)
+class Fit:
+    """How well the camera of one picture explains the points that it was placed by."""
+
+    points: int
+    error: float  # root mean square of the distance between a point's image and where it was seen [px]
+
+
+@dataclass(frozen=True, kw_only=True)
 class Solved:
     """What came out: a COLMAP folder with `images` and `sparse/0`, metres, z up."""
 
@@ -46,54 +58,78 @@ class Solved:
     error: float  # mean reprojection error [px]
     span: float  # largest angle between two cameras, seen from what they look at [deg]
     floor: bool  # whether a plane of points was taken as the floor
+    stills: dict[str, Fit] = field(default_factory=dict)  # by the name of each still
 
 
-def solve(images: Path, folder: Path, *, ordered: bool, camera_distance: float, seed: int, log) -> Solved:
-    """Cameras of the photographs in `images`, all by one lens if they are of one size; written below `folder`.
+def solve(
+    images: Path,
+    folder: Path,
+    *,
+    ordered: bool,
+    camera_distance: float,
+    seed: int,
+    log,
+    stills: Mapping[str, str] | None = None,
+) -> Solved:
+    """Cameras of the pictures in and below `images`, written below `folder`.
 
-    Raises ValueError, with what to do, if pycolmap is missing, the camera did not move, or fewer than half of the
-    photographs can be placed.
+    All photographs are by one lens if they are of one size, and so are all `stills`, names of pictures -> the clips
+    that they were taken from. Raises ValueError, with what to do, if pycolmap is missing, the camera did not move,
+    fewer than half of the photographs can be placed, or one of the stills cannot.
     """
     pycolmap = _pycolmap()
-    names = sorted(p.name for p in images.iterdir())
+    stills = dict(stills or {})
+    found = (p.relative_to(images).as_posix() for p in images.rglob("*") if p.is_file())
+    names = sorted(name for name in found if name not in stills)
     if len(names) < 3:
         raise ValueError(f"structure from motion needs at least 3 photographs, there are {len(names)}; take about 30")
     pycolmap.set_random_seed(seed)
     database = folder / "database.db"
     _extract(pycolmap, database, images, names, log)
-    _match(pycolmap, database, folder / "pairs.txt", names, ordered=ordered, log=log)
-    still = share_explained(_matches(pycolmap, database), _longest_side(pycolmap, database))
-    if still is not None:
-        log.metric("matches_without_parallax", still)
-    if still is not None and still > STANDING:
+    if stills:
+        _extract(pycolmap, database, images, sorted(stills), log)
+        _match(pycolmap, database, folder / "pairs.txt", [(s, n) for s in sorted(stills) for n in names], log=log)
+        for still, clip in stills.items():  # before the many pairs of photographs are compared
+            if not _compared(pycolmap, database, still):
+                raise _unplaced(clip, "not one photograph shows what it shows")
+    _match(pycolmap, database, folder / "pairs.txt", pairs(names, ordered=ordered), log=log)
+    standing = share_explained(_matches(pycolmap, database, without=set(stills)), _longest_side(pycolmap, database))
+    if standing is not None:
+        log.metric("matches_without_parallax", standing)
+    if standing is not None and standing > STANDING:
         raise ValueError(
-            f"the camera must move: one that stands still, turns or zooms explains {100 * still:.0f} % of what the "
+            f"the camera must move: one that stands still, turns or zooms explains {100 * standing:.0f} % of what the "
             f"{len(names)} pictures have in common, so they say nothing of depth; walk around the thing"
         )
-    model, angle = _placed(pycolmap, database, images, folder / "models", names, seed, log)
-    placed = sorted(i.name for i in model.images.values() if i.has_pose) if model else []
-    lost = tuple(n for n in names if n not in set(placed))
+    model, angle = _placed(pycolmap, database, images, folder / "models", [*names, *stills], seed, log)
+    have = {i.name for i in model.images.values() if i.has_pose} if model else set()
+    placed, lost = tuple(n for n in names if n in have), tuple(n for n in names if n not in have)
     if model is None or not _enough(len(placed), len(names)):
         raise ValueError(
             f"only {len(placed)} of {len(names)} photographs could be placed (not: {', '.join(lost[:6])}"
             f"{', ...' if len(lost) > 6 else ''}); take sharp ones, each overlapping the one before by two thirds, "
             "with texture around the object (a newspaper under it helps), or give cameras: scene.source ColmapSource"
         )
+    for name, clip in stills.items():
+        if name not in have:
+            raise _unplaced(clip, f"too little of it is seen in the {len(placed)} photographs that were placed")
     if angle < FIRST_ANGLES[0]:
         log.warn(f"no two photographs of the same points differ by {FIRST_ANGLES[0]:g} degrees; began with {angle:g}")
-    floor, span = upright(model, camera_distance, seed)
+    floor, span = upright(model, camera_distance, seed, without=set(stills))
     model.write(_made(folder / "sparse" / "0"))
     error = float(model.compute_mean_reprojection_error())
-    return Solved(folder=folder, placed=tuple(placed), lost=lost, error=error, span=span, floor=floor)
+    fits = {name: _fit(model, name) for name in stills}
+    return Solved(folder=folder, placed=placed, lost=lost, error=error, span=span, floor=floor, stills=fits)
 
 
-def upright(model, camera_distance: float, seed: int) -> tuple[bool, float]:
-    """Turn, scale and shift a pycolmap.Reconstruction as told above, in place.
+def upright(model, camera_distance: float, seed: int, *, without: Collection[str] = ()) -> tuple[bool, float]:
+    """Turn, scale and shift a pycolmap.Reconstruction as told above, in place, whatever the pictures `without` say.
 
     Whether there is a floor, and the angle that the cameras span [deg]. Raises ValueError where they look apart.
     """
     pycolmap = _pycolmap()
-    poses = np.stack([i.cam_from_world().matrix() for i in model.images.values() if i.has_pose])
+    asked = [i for i in model.images.values() if i.has_pose and i.name not in without]
+    poses = np.stack([i.cam_from_world().matrix() for i in asked])
     points = np.stack([p.xyz for p in model.points3D.values()])
     R, t = poses[:, :, :3], poses[:, :, 3]
     seen = aim(R, t, points)
@@ -131,7 +167,7 @@ def _extract(pycolmap, database: Path, images: Path, names: list[str], log) -> N
             database, images, some, camera_mode=mode, reader_options=reader, extraction_options=options
         )
         if mode == pycolmap.CameraMode.SINGLE:
-            reader.existing_camera_id = 1  # the lens of the first
+            reader.existing_camera_id = _camera(pycolmap, database, names[0])  # the lens of the first
     with contextlib.closing(sqlite3.connect(database)) as db, db:
         rows = db.execute("SELECT image_id, rows, cols, data FROM keypoints WHERE rows > ?", (FEATURES,)).fetchall()
         for image, count, columns, data in rows:
@@ -147,8 +183,16 @@ def _extract(pycolmap, database: Path, images: Path, names: list[str], log) -> N
                 )
 
 
-def _match(pycolmap, database: Path, list_file: Path, names: list[str], *, ordered: bool, log) -> None:
-    wanted = pairs(names, ordered=ordered)
+def _camera(pycolmap, database: Path, name: str) -> int:
+    """COLMAP's number of the lens of a picture."""
+    opened = pycolmap.Database.open(database)
+    try:
+        return opened.read_image_with_name(name).camera_id
+    finally:
+        opened.close()
+
+
+def _match(pycolmap, database: Path, list_file: Path, wanted: list[tuple[str, str]], *, log) -> None:
     options = pycolmap.ImportedPairingOptions()
     options.match_list_path = list_file
     bar = log.progress(None, "comparing pairs of photographs", total=len(wanted))
@@ -160,16 +204,48 @@ def _match(pycolmap, database: Path, list_file: Path, names: list[str], *, order
     bar.close()
 
 
-def _matches(pycolmap, database: Path):
+def _compared(pycolmap, database: Path, name: str) -> bool:
+    """Whether any other picture shows the same points as this one."""
+    opened = pycolmap.Database.open(database)
+    try:
+        own = opened.read_image_with_name(name).image_id
+    finally:
+        opened.close()
+    with contextlib.closing(sqlite3.connect(database)) as db:
+        shared = [i for (i,) in db.execute("SELECT pair_id FROM two_view_geometries WHERE rows > 0")]
+    return any(own in pycolmap.pair_id_to_image_pair(pair) for pair in shared)
+
+
+def _unplaced(clip: str, why: str) -> ValueError:
+    return ValueError(
+        f"{clip}: its camera cannot be found, {why}; film the thing where it is photographed, in the same light, and "
+        "take some of the photographs from where the clip is filmed; or take the clip out of the folder"
+    )
+
+
+def _fit(model, name: str) -> Fit:
+    """Of one picture that is placed."""
+    image = model.find_image_with_name(name)
+    seen = [p for p in image.points2D if p.has_point3D()]
+    points = np.stack([model.points3D[p.point3D_id].xyz for p in seen])
+    local = image.cam_from_world() * points
+    off = image.camera.img_from_cam(local) - np.stack([p.xy for p in seen])
+    return Fit(points=len(seen), error=float(np.sqrt((off**2).sum(1).mean())))
+
+
+def _matches(pycolmap, database: Path, *, without: Collection[str] = ()):
     """Verified matches of pairs of photographs, spread over all pairs, from the middle of the pictures [px]."""
     opened = pycolmap.Database.open(database)
     try:
         cameras = {c.camera_id: np.array([c.width, c.height]) / 2 for c in opened.read_all_cameras()}
-        middle = {i.image_id: cameras[i.camera_id] for i in opened.read_all_images()}
+        pictures = opened.read_all_images()
+        middle = {i.image_id: cameras[i.camera_id] for i in pictures}
+        skipped = {i.image_id for i in pictures if i.name in without}
         with contextlib.closing(sqlite3.connect(database)) as db:
             found = [
                 i for (i,) in db.execute("SELECT pair_id FROM two_view_geometries WHERE rows > 0 ORDER BY pair_id")
             ]
+        found = [i for i in found if not skipped & set(pycolmap.pair_id_to_image_pair(i))]
         for k in np.unique(np.linspace(0, len(found) - 1, min(len(found), PAIRS_ASKED)).round().astype(int)):
             a, b = pycolmap.pair_id_to_image_pair(found[k])
             index = np.asarray(opened.read_two_view_geometry(a, b).inlier_matches)

@@ -7,6 +7,7 @@ and which way is up (`up`, in the axes of the first run). `Capture.floor` is 0 w
 import re
 import tempfile
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -41,25 +42,28 @@ class UnposedSource(AbstractSource):
 
     def files(self) -> tuple[str, ...]:
         path = Path(self.path)
-        return (str(path),) if _is_video(path) else tuple(str(p) for p in photographs_below(path))
+        return (str(path),) if is_video(path) else tuple(str(p) for p in photographs_below(path))
 
     def __call__(self, *, log) -> Capture:
         """Raises ValueError for settings out of range, no or too few photographs, or when they cannot be placed."""
         self.check()
         path = Path(self.path)
-        video = _is_video(path)
         with tempfile.TemporaryDirectory(prefix="physics3d_") as work:
             images = Path(work) / "images"
             images.mkdir()
-            called: dict[str, str] = {}  # copy -> the user's name of it
-            if video:
-                sharpest_frames(path, images, self.frames, self.longest_side, log)
-            else:
-                called = _copies(path, images, self.longest_side, triple("background", self.background), log)
-            solved = solve(
-                images, Path(work), ordered=video, camera_distance=self.camera_distance, seed=self.seed, log=log
+            background = triple("background", self.background)
+            called = gather(
+                path, images, frames=self.frames, longest_side=self.longest_side, background=background, log=log
             )
-            self._report(solved, log)
+            solved = solve(
+                images,
+                Path(work),
+                ordered=is_video(path),
+                camera_distance=self.camera_distance,
+                seed=self.seed,
+                log=log,
+            )
+            report(solved, self.camera_distance, log)
             capture = ColmapSource(
                 name=self.name,
                 path=str(solved.folder),
@@ -69,59 +73,92 @@ class UnposedSource(AbstractSource):
                 background=self.background,
                 single_object=self.single_object,
             )(log=log)
-        turned = tuple(self.up) != (0.0, 0.0, 1.0)
-        floor = 0.0 if solved.floor and not turned else None
-        said = f"{len(solved.placed)} photographs placed by structure from motion; scale and up are guesses: cameras "
-        said += f"{self.camera_distance:g} m away; " + ("the floor is z = 0" if floor == 0 else "no floor is known")
         names = tuple(called.get(name, name) for name in capture.names)
-        return replace(capture, names=names, note=said, floor=floor)
+        floor = floor_of(solved, self.up)
+        return replace(capture, names=names, note=told(solved, self.camera_distance, floor), floor=floor)
 
     def check(self) -> None:
         """Raise ValueError naming field, value and remedy."""
         require_fields(self, "source")
 
-    def _report(self, solved: Solved, log) -> None:
-        total = len(solved.placed) + len(solved.lost)
-        log.info(f"{len(solved.placed)} of {total} photographs placed, reprojection error {solved.error:.2f} px")
-        log.metric("photographs_placed", len(solved.placed))
-        log.metric("reprojection_error_px", solved.error)
-        log.metric("camera_span_deg", solved.span)
-        if solved.lost:
-            log.warn(f"not placed, left out: {', '.join(solved.lost[:12])}{', ...' if len(solved.lost) > 12 else ''}")
-        if solved.span < NARROW:
-            log.warn(
-                f"the cameras span only {solved.span:.0f} degrees around what they look at: depth is uncertain, and "
-                "what is behind was never seen; walk further around it"
-            )
-        log.info(
-            "assumed: up is the normal of the largest level plane, which is the floor at z = 0"
-            if solved.floor
-            else "assumed: the cameras were held upright on average; no floor was found, z = 0 is what they look at"
-        )
-        log.info(
-            f"assumed: the cameras are {self.camera_distance:g} m from what they look at; multiply camera_distance by "
-            "(true length / length in the model) if sizes are wrong"
-        )
+
+def gather(
+    path: Path,
+    target: Path,
+    *,
+    frames: int,
+    longest_side: int,
+    background: tuple[float, float, float],
+    log,
+    without: Path | None = None,
+) -> dict[str, str]:
+    """Copies of a folder's photographs, or the sharpest frames of a video, in `target`, no side longer than told [px].
+
+    Copy -> the user's name of it. Raises ValueError if there is nothing to read.
+    """
+    if is_video(path):
+        sharpest_frames(path, target, frames, longest_side, log)
+        return {}
+    return _copies(path, target, longest_side, background, log, without=without)
 
 
-def photographs_below(folder: Path, log=None) -> list[Path]:
+def report(solved: Solved, camera_distance: float, log) -> None:
+    """Say what was placed, how well, and what was assumed."""
+    total = len(solved.placed) + len(solved.lost)
+    log.info(f"{len(solved.placed)} of {total} photographs placed, reprojection error {solved.error:.2f} px")
+    log.metric("photographs_placed", len(solved.placed))
+    log.metric("reprojection_error_px", solved.error)
+    log.metric("camera_span_deg", solved.span)
+    if solved.lost:
+        log.warn(f"not placed, left out: {', '.join(solved.lost[:12])}{', ...' if len(solved.lost) > 12 else ''}")
+    if solved.span < NARROW:
+        log.warn(
+            f"the cameras span only {solved.span:.0f} degrees around what they look at: depth is uncertain, and "
+            "what is behind was never seen; walk further around it"
+        )
+    log.info(
+        "assumed: up is the normal of the largest level plane, which is the floor at z = 0"
+        if solved.floor
+        else "assumed: the cameras were held upright on average; no floor was found, z = 0 is what they look at"
+    )
+    log.info(
+        f"assumed: the cameras are {camera_distance:g} m from what they look at; multiply camera_distance by "
+        "(true length / length in the model) if sizes are wrong"
+    )
+
+
+def floor_of(solved: Solved, up: Sequence[float]) -> float | None:
+    """Height of the floor [m]; None where none was found, or where `up` turned it away."""
+    return 0.0 if solved.floor and tuple(up) == (0.0, 0.0, 1.0) else None
+
+
+def told(solved: Solved, camera_distance: float, floor: float | None) -> str:
+    """What is said at the start of every run."""
+    said = f"{len(solved.placed)} photographs placed by structure from motion; scale and up are guesses: cameras "
+    return said + f"{camera_distance:g} m away; " + ("the floor is z = 0" if floor == 0 else "no floor is known")
+
+
+def photographs_below(folder: Path, log=None, *, without: Path | None = None) -> list[Path]:
     """The photographs of a folder; where it holds none itself, of its subfolders. What is not read is said.
 
-    Raises ValueError if there are none.
+    Nothing in the subfolder `without` counts. Raises ValueError if there are none.
     """
     if not folder.is_dir():
         raise ValueError(
             f"no folder of photographs and no video ({', '.join(VIDEOS)}) at {folder}; "
             "give it: make run SCENE=photos DATA=<folder or video>"
         )
-    below = [d for d in sorted(folder.rglob("*")) if d.is_dir() and not _hidden(d.relative_to(folder))]
+    shown = [p for p in sorted(folder.rglob("*")) if not _hidden(p.relative_to(folder))]
+    if without is not None:
+        shown = [p for p in shown if not p.is_relative_to(without)]
+    below = [p for p in shown if p.is_dir()]
     found = photographs_in(folder)
     deeper = [p for d in below for p in photographs_in(d)]
     if found and deeper and log is not None:
         log.warn(f"{len(deeper)} photographs in subfolders of {folder} are left out; give the subfolder, or move them")
     found = found or deeper
     taken = set(found) | set(deeper)
-    files = [p for p in sorted(folder.rglob("*")) if p.is_file() and not _hidden(p.relative_to(folder))]
+    files = [p for p in shown if p.is_file()]
     others = Counter(p.suffix.lower() or "no ending" for p in files if p not in taken)
     unread = {ending: count for ending, count in others.items() if ending in UNREAD}
     if not found:
@@ -141,12 +178,18 @@ def _hidden(path: Path) -> bool:
     return any(part.startswith((".", "__MACOSX", "@")) for part in path.parts)
 
 
-def _is_video(path: Path) -> bool:
+def is_video(path: Path) -> bool:
     return path.suffix.lower() in VIDEOS if not path.exists() else path.is_file()
 
 
 def _copies(
-    folder: Path, target: Path, longest_side: int, background: tuple[float, float, float], log
+    folder: Path,
+    target: Path,
+    longest_side: int,
+    background: tuple[float, float, float],
+    log,
+    *,
+    without: Path | None = None,
 ) -> dict[str, str]:
     """Turned as their EXIF says, reduced, as JPEG that keeps the EXIF focal length; with alpha as PNG.
 
@@ -156,12 +199,12 @@ def _copies(
     from PIL import Image
 
     called: dict[str, str] = {}
-    with_matte, without = [], []
-    for path in log.progress(photographs_below(folder, log), "reading photographs"):
+    with_matte, with_none = [], []
+    for path in log.progress(photographs_below(folder, log, without=without), "reading photographs"):
         picture = read_picture(path).shown()
         matte = picture.alpha
         if matte is None:
-            without.append(path.name)
+            with_none.append(path.name)
         elif matte.min() < 1:
             with_matte.append(path.name)
         name = re.sub(r"\s", "_", "__".join(path.relative_to(folder).with_suffix("").parts))
@@ -177,9 +220,9 @@ def _copies(
             array[array[..., 3] == 0, :3] = np.round(255 * np.asarray(background)).astype(np.uint8)
             copy = Image.fromarray(array)
         copy.save(target / name, quality=97, exif=_without_turn(path))
-    if with_matte and without:
+    if with_matte and with_none:
         raise ValueError(
-            f"{without[0]} has no alpha channel, but {with_matte[0]} has one that hides something; give all "
+            f"{with_none[0]} has no alpha channel, but {with_matte[0]} has one that hides something; give all "
             "photographs a matte or none"
         )
     return called

@@ -49,7 +49,7 @@ from pipeline.settings import CONF, GROUPS, SettingsError, choices, compose
         # taken away, or added
         ("~simulate.force.z", r"simulate\.force is .*; take x, y, z, each a number"),
         ("~scene.dx", r"scene\.dx is not there, but others are taken from it; keep it"),
-        ("~reconstruct", r"reconstruct is null; only segment, learn, evaluate may be"),
+        ("~reconstruct", r"reconstruct is null; only segment, learn, foretell, evaluate may be"),
         ("+learn.foo=1", r"learn\.foo: Learn has no such field; there are world, prior"),
         ("+foo=1", r"foo: there is no such entry; there are data, output"),
         ("carnation", r"'carnation' is not of the form key=value"),

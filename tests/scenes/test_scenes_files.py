@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import scene_formats as formats
 import torch
+from clips import FPS, decaying, swaying
 from PIL import Image
 from test_scenes_loaders import Z_UP, write
 from test_scenes_strangers import transforms, write_llff
@@ -16,7 +17,9 @@ from physics3d.gaussians.ply import write_ply
 from physics3d.log import Log
 from physics3d.scenes.llff import LlffSource
 from physics3d.scenes.ply import PlyScene
+from physics3d.scenes.thing import ThingSource
 from physics3d.scenes.unposed import UnposedSource
+from physics3d.video import write_mp4
 
 opened: list[Path] | None = None  # where a test is listening
 
@@ -44,9 +47,12 @@ def source(kind: str, folder: Path):
         )
         write_ply(folder / "model.ply", cloud)
         return PlyScene(name="x", path=str(folder / "model.ply"), up=(0, 0, 1), scale=1.0, views=1, width=8, height=8)
-    if kind == "photographs":
+    if kind in ("photographs", "thing"):
         for i in range(2):  # too few for structure from motion: they are read, then refused
             Image.fromarray(np.full((80, 80, 3), 90 + i, np.uint8)).save(folder / f"{i}.png")
+        if kind == "thing":
+            write_mp4(folder / "clips" / "a.mp4", swaying(decaying(np.arange(30) / FPS)), FPS)
+            return ThingSource(name="x", path=str(folder), camera_distance=1.0)
         return UnposedSource(name="x", path=str(folder), camera_distance=1.0)
     if kind == "llff":
         write_llff(folder, Z_UP)
@@ -74,7 +80,7 @@ def source(kind: str, folder: Path):
     "kind",
     [
         *("blender", "pinhole", "masks and points", "colmap_text", "colmap_binary", "llff", "pac_nerf", "ply"),
-        "photographs",
+        *("photographs", "thing"),
     ],
 )
 def test_what_is_read_is_listed(kind, tmp_path):
@@ -85,7 +91,7 @@ def test_what_is_read_is_listed(kind, tmp_path):
     try:
         made(log=Log(None))
     except ValueError as error:
-        assert kind == "photographs" and "at least 3" in str(error)
+        assert kind in ("photographs", "thing") and "at least 3" in str(error)
     finally:
         read = {path.resolve() for path in opened if path.resolve().is_relative_to(tmp_path)}
         opened = None
