@@ -12,8 +12,9 @@ every mode has three roots s: an oscillation, and the creep of its dash-pot. The
 
 Against the flow (`seen_modes.py`) the a, b, c are linear least squares, solved inside for any material (variable
 projection, Golub and Pereyra 1973); a mode that a camera hardly sees is held near zero by a hundredth of what its
-motion in space would cost if it were seen. The material is sought from the frequency of the clip's largest
-oscillation (`motion/decay.py`), taken for each of the lowest modes in turn: no guess of a person's is asked for.
+motion in space would cost if it were seen, and more by as much as its energy is above that of the mode seen most. The
+material is sought from the frequency of the clip's largest oscillation (`motion/decay.py`), taken in turn for the modes
+whose shapes alone explain most of the motion: no guess of a person's is asked for.
 
 One free motion tells stiffness over density, for the size that was given; zones are taken up only where the clip asks
 for them (a tenth of the unexplained motion less).
@@ -30,8 +31,8 @@ from physics3d.learning.seen_modes import Observed
 from physics3d.log import Log
 from physics3d.modes import vibration
 
-MODES = 8
-GUESSES = 3  # of the lowest modes, that the largest oscillation may be
+MODES = 16
+GUESSES = 4  # of the modes that alone explain most, that the largest oscillation may be
 FAINT = 0.01  # cost of a motion in space that is not seen, in that of one that is
 WIDTH = {"zone": 0.7, "ratio": 2.0, "time": 3.0}  # of what is thought likely beforehand, in the logarithm
 LIKELY = {"ratio": 0.3, "time": 0.1}  # r, and tau [s]
@@ -160,7 +161,8 @@ def start(
     right = np.einsum("akt,tk->ak", functions, b).reshape(n)
     seen = float(clip.weight.sum())
     space = np.einsum("mk,mn,nk->k", shape, body.weight, shape) * body.scale**2
-    ridge = FAINT * np.tile(space, 3) * seen
+    main = int(np.argmax((b**2).sum(0) / np.maximum(np.einsum("tkk->k", G), 1e-30)))
+    ridge = FAINT * np.tile(space * np.maximum(1, square / square[main]), 3) * seen
     x = np.linalg.solve(normal + np.diag(ridge), right)
     left = float(square_sum.sum() - 2 * x @ right + x @ normal @ x)
     a, s, c = x.reshape(3, -1)
@@ -200,10 +202,13 @@ def fit(
         return start(body, material, window, since=0.0, reference=at)[1] / moved + PRIOR * material.improbability()
 
     nothing = np.zeros(zones)
-    square, _ = modal(body, Material(stiffness=0.0, zones=nothing, ratio=0.0, time=0.0))
-    swings = np.sqrt(square[square > 1e-6 * square.max()]) / (2 * np.pi)  # what is held nowhere drifts in six modes
+    square, shape = modal(body, Material(stiffness=0.0, zones=nothing, ratio=0.0, time=0.0))
+    alone = np.sum((window.right @ shape) ** 2, 0) / np.einsum("mk,tmn,nk->k", shape, window.gram, shape, optimize=True)
+    # what is held nowhere drifts in six modes; a leaf may swing slowly, but it is not most of what is seen
+    likely = np.argsort(np.where(square > 1e-9 * square.max(), -alone, 0.0), kind="stable")[:GUESSES]
+    swings = np.sqrt(square[likely]) / (2 * np.pi)
     best: optimize.OptimizeResult | None = None
-    for guess in swings[:GUESSES]:
+    for guess in swings:
         first = np.array([2 * math.log(frequency / guess), math.log(LIKELY["ratio"]), math.log(LIKELY["time"])])
         found = _descended(lambda x: cost(np.concatenate([x, nothing])), first, 250)
         log.info(f"largest oscillation taken for a mode at {guess:.3g} Hz: {100 * found.fun:.1f} % left unexplained")
