@@ -21,7 +21,7 @@ for them (a tenth of the unexplained motion less).
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -31,7 +31,7 @@ from physics3d.learning.seen_modes import Observed
 from physics3d.log import Log
 from physics3d.modes import vibration
 
-MODES = 16
+MODES = 16  # that a motion is made of
 GUESSES = 4  # of the modes that alone explain most, that the largest oscillation may be
 FAINT = 0.01  # cost of a motion in space that is not seen, in that of one that is
 WIDTH = {"zone": 0.7, "ratio": 2.0, "time": 3.0}  # of what is thought likely beforehand, in the logarithm
@@ -76,15 +76,15 @@ class Material:
 class FreeMotion:
     """Modes with their start: the body's motion from time 0 on, and before it as if it had been free."""
 
-    shape: Float[np.ndarray, "m k"]  # phi_k in the basis
+    shape: Float[np.ndarray, "m k"]  # phi_k in the basis, of unit mass [kg^(-1/2)]
     frequency: Float[np.ndarray, " k"]  # [Hz]
     damping: Float[np.ndarray, " k"]  # [1/s]
     creep: Float[np.ndarray, " k"]  # r_k [1/s]
-    cosine: Float[np.ndarray, " k"]
-    sine: Float[np.ndarray, " k"]
-    slow: Float[np.ndarray, " k"]  # c
+    cosine: Float[np.ndarray, " k"]  # a_k, of modes of unit mass [m kg^(1/2)]
+    sine: Float[np.ndarray, " k"]  # b_k
+    slow: Float[np.ndarray, " k"]  # c_k
     unexplained: float  # share of the motion
-    loudness: Float[np.ndarray, " k"] = field(default_factory=lambda: np.zeros(0))  # rms of each mode when seen [px]
+    loudness: Float[np.ndarray, " k"]  # rms of each mode when seen [px]
 
     def at(self, t: float) -> Float[np.ndarray, " m"]:
         """Amplitudes at time t [s]."""
@@ -132,28 +132,24 @@ def start(
     material: Material,
     clip: Observed,
     *,
-    since: float,
     known: Float[np.ndarray, " m"] | None = None,
     reference: float | None = None,
 ) -> tuple[FreeMotion, float]:
-    """(the motion that fits a clip best, its cost [px^2]). Times count from the first frame of the clip's window, which
-    is `since` seconds after time 0 of the motion.
+    """(the motion that fits a clip best, its cost [px^2]). Time 0 is the first frame of the clip.
 
     The flow counts from the frame at time `reference` [s], or from a picture of which the amplitudes `known` are given.
     """
     square, shape = modal(body, material)
     f, d, r = roots(square, math.exp(material.ratio), math.exp(material.time))
-    t = since + np.arange(len(clip.gram)) / clip.fps
+    t = np.arange(len(clip.gram)) / clip.fps
     functions = time_functions(f, d, r, t)
-    base = known
     if reference is not None:
         functions = functions - time_functions(f, d, r, np.array([reference]))
     G = np.einsum("mk,tmn,nl->tkl", shape, clip.gram, shape, optimize=True)
-    b = clip.right
-    square_sum = clip.square
-    if base is not None:  # u + J q_0 is what the motion has to explain
-        b = b + clip.gram @ base
-        square_sum = square_sum + 2 * clip.right @ base + np.einsum("m,tmn,n->t", base, clip.gram, base)
+    b, square_sum = clip.right, clip.square
+    if known is not None:  # u + J q_0 is what the motion has to explain
+        b = b + clip.gram @ known
+        square_sum = square_sum + 2 * clip.right @ known + np.einsum("m,tmn,n->t", known, clip.gram, known)
     b = b @ shape
     normal = np.einsum("akt,tkl,blt->akbl", functions, G, functions, optimize=True)
     n = 3 * len(f)
@@ -187,9 +183,8 @@ def fit(
 ) -> tuple[Material, FreeMotion]:
     """The material that explains frames from `release` on, and the motion, whose time 0 is that frame.
 
-    `frequency`: of the clip's largest oscillation [Hz]; `reference`: the frame that the flow
-    counts from; None: a picture of the body at rest. Raises
-    ValueError where no material makes the body swing like it.
+    `frequency`: of the clip's largest oscillation [Hz]; `reference`: the frame that the flow counts from; None: a
+    picture of the body at rest.
     """
     window, zones = clip.window(release, len(clip.gram)), len(body.zones)
     at = None if reference is None else (reference - release) / clip.fps
@@ -199,7 +194,7 @@ def fit(
         material = Material.of(theta)
         if not np.all(np.abs(theta) < 40):
             return 1e3
-        return start(body, material, window, since=0.0, reference=at)[1] / moved + PRIOR * material.improbability()
+        return start(body, material, window, reference=at)[1] / moved + PRIOR * material.improbability()
 
     nothing = np.zeros(zones)
     square, shape = modal(body, Material(stiffness=0.0, zones=nothing, ratio=0.0, time=0.0))
@@ -228,7 +223,7 @@ def fit(
     # told one way: zones are zero in the mean
     theta[0], theta[3:] = theta[0] + theta[3:].mean(), theta[3:] - theta[3:].mean()
     material = Material.of(theta)
-    return material, start(body, material, window, since=0.0, reference=at)[0]
+    return material, start(body, material, window, reference=at)[0]
 
 
 def _descended(cost, first: np.ndarray, evaluations: int) -> optimize.OptimizeResult:
