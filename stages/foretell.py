@@ -62,7 +62,7 @@ class Foretell:
         motions = {}
         for name, material in ((LEARNED, learned), (START, before)):
             window = clip.window(release, seen)
-            motion, _ = start(ready.reduced, material, window, since=0.0, reference=reference)
+            motion, _ = start(ready.reduced, material, window, reference=reference)
             motions[name] = motion
             pose[name] = None if reference is None else motion.at(reference)
         scores |= self.judged(ready, take, motions, flow[-1], release=release, seen=seen, notes=notes, log=log)
@@ -101,7 +101,6 @@ class Foretell:
                 ready.reduced,
                 material,
                 clip.window(release, seen),
-                since=0.0,
                 known=None if take.at_rest else pose[name],
             )[0]
             for name, material in materials.items()

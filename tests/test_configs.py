@@ -195,7 +195,8 @@ def test_what_is_recommended_composes(word):
 @pytest.mark.parametrize("key", mentioned())
 def test_what_is_mentioned_exists(key):
     found = False
-    for words in ((), ("scene=bird",), ("prior=modelscope",), ("prior=stable_video",), ("masker=sam2",)):
+    for word in ("", "scene=bird", "scene=clip", "prior=modelscope", "prior=stable_video", "masker=sam2"):
+        words = (word,) if word else ()
         node: Any = composed(words)[0]
         for name in key.split("."):
             node = node.get(name, ...) if isinstance(node, dict) else ...

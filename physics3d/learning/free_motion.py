@@ -12,15 +12,16 @@ every mode has three roots s: an oscillation, and the creep of its dash-pot. The
 
 Against the flow (`seen_modes.py`) the a, b, c are linear least squares, solved inside for any material (variable
 projection, Golub and Pereyra 1973); a mode that a camera hardly sees is held near zero by a hundredth of what its
-motion in space would cost if it were seen. The material is sought from the frequency of the clip's largest
-oscillation (`motion/decay.py`), taken for each of the lowest modes in turn: no guess of a person's is asked for.
+motion in space would cost if it were seen, and more by as much as its energy is above that of the mode seen most. The
+material is sought from the frequency of the clip's largest oscillation (`motion/decay.py`), taken in turn for the modes
+whose shapes alone explain most of the motion: no guess of a person's is asked for.
 
 One free motion tells stiffness over density, for the size that was given; zones are taken up only where the clip asks
 for them (a tenth of the unexplained motion less).
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -30,8 +31,8 @@ from physics3d.learning.seen_modes import Observed
 from physics3d.log import Log
 from physics3d.modes import vibration
 
-MODES = 8
-GUESSES = 3  # of the lowest modes, that the largest oscillation may be
+MODES = 16  # that a motion is made of
+GUESSES = 4  # of the modes that alone explain most, that the largest oscillation may be
 FAINT = 0.01  # cost of a motion in space that is not seen, in that of one that is
 WIDTH = {"zone": 0.7, "ratio": 2.0, "time": 3.0}  # of what is thought likely beforehand, in the logarithm
 LIKELY = {"ratio": 0.3, "time": 0.1}  # r, and tau [s]
@@ -75,15 +76,15 @@ class Material:
 class FreeMotion:
     """Modes with their start: the body's motion from time 0 on, and before it as if it had been free."""
 
-    shape: Float[np.ndarray, "m k"]  # phi_k in the basis
+    shape: Float[np.ndarray, "m k"]  # phi_k in the basis, of unit mass [kg^(-1/2)]
     frequency: Float[np.ndarray, " k"]  # [Hz]
     damping: Float[np.ndarray, " k"]  # [1/s]
     creep: Float[np.ndarray, " k"]  # r_k [1/s]
-    cosine: Float[np.ndarray, " k"]
-    sine: Float[np.ndarray, " k"]
-    slow: Float[np.ndarray, " k"]  # c
+    cosine: Float[np.ndarray, " k"]  # a_k, of modes of unit mass [m kg^(1/2)]
+    sine: Float[np.ndarray, " k"]  # b_k
+    slow: Float[np.ndarray, " k"]  # c_k
     unexplained: float  # share of the motion
-    loudness: Float[np.ndarray, " k"] = field(default_factory=lambda: np.zeros(0))  # rms of each mode when seen [px]
+    loudness: Float[np.ndarray, " k"]  # rms of each mode when seen [px]
 
     def at(self, t: float) -> Float[np.ndarray, " m"]:
         """Amplitudes at time t [s]."""
@@ -131,28 +132,24 @@ def start(
     material: Material,
     clip: Observed,
     *,
-    since: float,
     known: Float[np.ndarray, " m"] | None = None,
     reference: float | None = None,
 ) -> tuple[FreeMotion, float]:
-    """(the motion that fits a clip best, its cost [px^2]). Times count from the first frame of the clip's window, which
-    is `since` seconds after time 0 of the motion.
+    """(the motion that fits a clip best, its cost [px^2]). Time 0 is the first frame of the clip.
 
     The flow counts from the frame at time `reference` [s], or from a picture of which the amplitudes `known` are given.
     """
     square, shape = modal(body, material)
     f, d, r = roots(square, math.exp(material.ratio), math.exp(material.time))
-    t = since + np.arange(len(clip.gram)) / clip.fps
+    t = np.arange(len(clip.gram)) / clip.fps
     functions = time_functions(f, d, r, t)
-    base = known
     if reference is not None:
         functions = functions - time_functions(f, d, r, np.array([reference]))
     G = np.einsum("mk,tmn,nl->tkl", shape, clip.gram, shape, optimize=True)
-    b = clip.right
-    square_sum = clip.square
-    if base is not None:  # u + J q_0 is what the motion has to explain
-        b = b + clip.gram @ base
-        square_sum = square_sum + 2 * clip.right @ base + np.einsum("m,tmn,n->t", base, clip.gram, base)
+    b, square_sum = clip.right, clip.square
+    if known is not None:  # u + J q_0 is what the motion has to explain
+        b = b + clip.gram @ known
+        square_sum = square_sum + 2 * clip.right @ known + np.einsum("m,tmn,n->t", known, clip.gram, known)
     b = b @ shape
     normal = np.einsum("akt,tkl,blt->akbl", functions, G, functions, optimize=True)
     n = 3 * len(f)
@@ -160,7 +157,8 @@ def start(
     right = np.einsum("akt,tk->ak", functions, b).reshape(n)
     seen = float(clip.weight.sum())
     space = np.einsum("mk,mn,nk->k", shape, body.weight, shape) * body.scale**2
-    ridge = FAINT * np.tile(space, 3) * seen
+    main = int(np.argmax((b**2).sum(0) / np.maximum(np.einsum("tkk->k", G), 1e-30)))
+    ridge = FAINT * np.tile(space * np.maximum(1, square / square[main]), 3) * seen
     x = np.linalg.solve(normal + np.diag(ridge), right)
     left = float(square_sum.sum() - 2 * x @ right + x @ normal @ x)
     a, s, c = x.reshape(3, -1)
@@ -185,9 +183,8 @@ def fit(
 ) -> tuple[Material, FreeMotion]:
     """The material that explains frames from `release` on, and the motion, whose time 0 is that frame.
 
-    `frequency`: of the clip's largest oscillation [Hz]; `reference`: the frame that the flow
-    counts from; None: a picture of the body at rest. Raises
-    ValueError where no material makes the body swing like it.
+    `frequency`: of the clip's largest oscillation [Hz]; `reference`: the frame that the flow counts from; None: a
+    picture of the body at rest.
     """
     window, zones = clip.window(release, len(clip.gram)), len(body.zones)
     at = None if reference is None else (reference - release) / clip.fps
@@ -197,13 +194,16 @@ def fit(
         material = Material.of(theta)
         if not np.all(np.abs(theta) < 40):
             return 1e3
-        return start(body, material, window, since=0.0, reference=at)[1] / moved + PRIOR * material.improbability()
+        return start(body, material, window, reference=at)[1] / moved + PRIOR * material.improbability()
 
     nothing = np.zeros(zones)
-    square, _ = modal(body, Material(stiffness=0.0, zones=nothing, ratio=0.0, time=0.0))
-    swings = np.sqrt(square[square > 1e-6 * square.max()]) / (2 * np.pi)  # what is held nowhere drifts in six modes
+    square, shape = modal(body, Material(stiffness=0.0, zones=nothing, ratio=0.0, time=0.0))
+    alone = np.sum((window.right @ shape) ** 2, 0) / np.einsum("mk,tmn,nk->k", shape, window.gram, shape, optimize=True)
+    # what is held nowhere drifts in six modes; a leaf may swing slowly, but it is not most of what is seen
+    likely = np.argsort(np.where(square > 1e-9 * square.max(), -alone, 0.0), kind="stable")[:GUESSES]
+    swings = np.sqrt(square[likely]) / (2 * np.pi)
     best: optimize.OptimizeResult | None = None
-    for guess in swings[:GUESSES]:
+    for guess in swings:
         first = np.array([2 * math.log(frequency / guess), math.log(LIKELY["ratio"]), math.log(LIKELY["time"])])
         found = _descended(lambda x: cost(np.concatenate([x, nothing])), first, 250)
         log.info(f"largest oscillation taken for a mode at {guess:.3g} Hz: {100 * found.fun:.1f} % left unexplained")
@@ -223,7 +223,7 @@ def fit(
     # told one way: zones are zero in the mean
     theta[0], theta[3:] = theta[0] + theta[3:].mean(), theta[3:] - theta[3:].mean()
     material = Material.of(theta)
-    return material, start(body, material, window, since=0.0, reference=at)[0]
+    return material, start(body, material, window, reference=at)[0]
 
 
 def _descended(cost, first: np.ndarray, evaluations: int) -> optimize.OptimizeResult:

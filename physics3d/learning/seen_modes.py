@@ -58,13 +58,12 @@ class Observed:
     right: Float[np.ndarray, "t m"]  # b
     square: Float[np.ndarray, " t"]  # e
     weight: Float[np.ndarray, " t"]  # sum_x w
-    pixels: int
     fps: float  # [1/s]
 
     def window(self, first: int, end: int) -> "Observed":
         """Frames first to end - 1."""
         part = {name: getattr(self, name)[first:end] for name in ("gram", "right", "square", "weight")}
-        return Observed(**part, pixels=self.pixels, fps=self.fps)
+        return Observed(**part, fps=self.fps)
 
 
 def sight(gaussians: Gaussians, body: Body, camera: Camera, basis: Float[np.ndarray, "p r"]) -> Sight:
@@ -125,7 +124,6 @@ def observe(
         right=right,
         square=(W[..., None] * U**2).sum((1, 2)),
         weight=W.sum(1),
-        pixels=len(i),
         fps=fps,
     )
     return observed, u

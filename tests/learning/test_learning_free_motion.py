@@ -68,7 +68,6 @@ def filmed(body, truth, rng, *, frames=75, noise=0.02):
         right=seen @ J,
         square=(seen**2).sum(1),
         weight=np.full(frames, float(len(J))),
-        pixels=len(J),
         fps=FPS,
     ), q
 
@@ -101,6 +100,6 @@ def test_a_start_is_told_by_another_clip_of_the_same_thing(rng):
     body = chain(zones=1)
     truth = Material(stiffness=1.0, zones=np.zeros(1), ratio=-1.0, time=-2.0)
     clip, q = filmed(body, truth, rng, frames=60)
-    motion, _ = start(body, truth, clip.window(0, 20), since=0.0, known=q[-1])
+    motion, _ = start(body, truth, clip.window(0, 20), known=q[-1])
     later = np.stack([motion.at(i / FPS) for i in range(20, 60)])
     assert np.linalg.norm(later - q[20:]) < 0.1 * np.linalg.norm(q[20:])
