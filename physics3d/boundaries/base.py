@@ -57,6 +57,7 @@ class AbstractBoundary(abc.ABC):
         touch(x: vec3, radius: real, q, a, clock, row, b) -> bool
         acceleration(weight: real, x: vec3, q, a, clock, row, b) -> vec3
         grip(weight: real, q, a, clock, row, b) -> real, from 0 to 1
+        ahead(x: vec3, q, a) -> real [m]: of what is gripped and stays at rest, how far x is before its face
         steer(x: vec3, q, a, clock, row, b) -> (vec3, mat33)
     where q[a + i] is its i-th parameter, clock[row, b + i] its i-th signal in this substep, clock[row, 0] is dt, x is
     in metres, weight what `selection` gave for the particle (never 0 in a call), and radius half the edge of the cube
@@ -101,6 +102,9 @@ class AbstractBoundary(abc.ABC):
         return None
 
     def grip(self, real: type) -> wp.Function | None:
+        return None
+
+    def ahead(self, real: type) -> wp.Function | None:
         return None
 
     def steer(self, real: type) -> wp.Function | None:

@@ -55,11 +55,28 @@ class FixedRegion(base.AbstractBoundary):
     def grip(self, real: type) -> wp.Function:
         return gripped.while_on(real)
 
+    def ahead(self, real: type) -> wp.Function:
+        return _ahead(real)
+
     def steer(self, real: type) -> wp.Function:
         return gripped.still(real)
 
     def node(self, real: type) -> wp.Function:
         return _node(real)
+
+
+@functools.cache
+def _ahead(real: type) -> wp.Function:
+    """Signed distance from a box."""
+    vec3 = vector(real)
+
+    @wp.func(name=f"before_region_{real.__name__}")
+    def ahead(x: vec3, q: wp.array(dtype=real), a: int):
+        lower, upper = vec3(q[a], q[a + 1], q[a + 2]), vec3(q[a + 3], q[a + 4], q[a + 5])
+        out = wp.max(lower - x, x - upper)
+        return wp.length(wp.max(out, vec3())) + wp.min(wp.max(out[0], wp.max(out[1], out[2])), real(0.0))
+
+    return ahead
 
 
 @functools.cache

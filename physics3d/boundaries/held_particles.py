@@ -1,7 +1,9 @@
 """Held particles: the body does not move where these particles are at rest (a flower where it touches its pot).
 
 What `FixedRegion` is for a box, this is for any set of places, found rather than written down by hand. The face of what
-is held lies halfway to the next particle.
+is held lies halfway between it and the particles next to it: a facet for each particle at the face, across the mean
+way to its free neighbours. A place is as far before the face as it is before the nearest facet. In `parameters`:
+    number of facets, then for each its centre (3) [m] and its unit normal (3), out of what is held.
 """
 
 import functools
@@ -15,6 +17,10 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from physics3d.boundaries import base, gripped
+from physics3d.warp_types import vector
+
+
+BESIDE = 1.3  # particles so far apart are neighbours [of the least distance from a held one to a free one]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,8 +37,9 @@ class HeldParticles(base.AbstractBoundary):
         right = len(shape) == 2 and shape[0] > 0 and shape[1] == 3
         base.require(right and finite, self, "position", "finite positions [h, 3] in metres, at least one")
 
-    def parameters(self, setting: base.Setting) -> Float[Tensor, "0"]:
-        return torch.zeros(0, dtype=torch.float64)
+    def parameters(self, setting: base.Setting) -> Float[Tensor, " k"]:
+        facets = self._facets(setting)
+        return torch.cat([torch.tensor([float(len(facets))], dtype=torch.float64), facets.flatten()])
 
     def selection(self, setting: base.Setting) -> Float[Tensor, " p"]:
         return self.holds(setting)
@@ -45,8 +52,28 @@ class HeldParticles(base.AbstractBoundary):
     def grip(self, real: type) -> wp.Function:
         return _grip(real)
 
+    def ahead(self, real: type) -> wp.Function:
+        return _ahead(real)
+
     def steer(self, real: type) -> wp.Function:
         return gripped.still(real)
+
+    def _facets(self, setting: base.Setting) -> Float[Tensor, "f 6"]:
+        position = setting.position.detach().double().numpy()
+        mine = self.holds(setting).numpy() > 0
+        if mine.all():
+            return torch.zeros(0, 6, dtype=torch.float64)
+        held, free = position[mine], position[~mine]
+        least = cKDTree(free).query(held)[0]
+        spacing = float(least.min())
+        facets = []
+        for place, others in zip(held, cKDTree(free).query_ball_point(held, BESIDE * spacing), strict=True):
+            if others:
+                way = (free[others] - place).mean(0)
+                length = float(np.linalg.norm(way))
+                if length > 1e-6 * spacing:
+                    facets.append(np.concatenate([place + way / 2, way / length]))
+        return torch.from_numpy(np.array(facets))
 
     def _nearest(self, setting: base.Setting) -> np.ndarray:
         """Index of the particle nearest to each position."""
@@ -54,6 +81,25 @@ class HeldParticles(base.AbstractBoundary):
 
     def _positions(self) -> Float[Tensor, "h 3"]:
         return torch.as_tensor(self.position, dtype=torch.float64).detach().cpu()
+
+
+@functools.cache
+def _ahead(real: type) -> wp.Function:
+    vec3 = vector(real)
+
+    @wp.func(name=f"before_held_particles_{real.__name__}")
+    def ahead(x: vec3, q: wp.array(dtype=real), a: int):
+        found, least = real(-1e30), real(1e30)  # nothing free anywhere near: all is behind
+        for k in range(int(q[a])):
+            at = a + 1 + 6 * k
+            way = x - vec3(q[at], q[at + 1], q[at + 2])
+            near = wp.length_sq(way)
+            if near < least:
+                least = near
+                found = wp.dot(way, vec3(q[at + 3], q[at + 4], q[at + 5]))
+        return found
+
+    return ahead
 
 
 @functools.cache

@@ -3,9 +3,11 @@
 A particle is gripped by a share 0..1 of its volume (`grip` of the boundaries). That share gives the nodes no momentum
 and no stress, for it is no part of the problem; what it gives them is told apart, as mass. The rest of the particle is
 free and is scattered as ever. From the share c of a node's mass that is gripped follows its distance from the face
-between both, in cells: with quadratic splines N and a plane face s cells away,
+between both, in cells: with quadratic splines N, a plane face s cells away, and matter enough behind it,
 
     c(s) = int_s^(3/2) N = (3/2 - s)^3/6 (1/2 < s < 3/2),   1/2 - 3 s/4 + s^3/3 (|s| < 1/2),   c(-s) = 1 - c(s)
+
+What stays where it is says itself where its face is (`ahead` of the boundaries), however thin it is.
 
 Nodes behind the face or next to it follow the node before them: with V the imposed velocity the trial functions v - V
 are straight there and vanish on the face wherever it lies between nodes,
@@ -91,11 +93,16 @@ def hold(real, grips: tuple[Hook, ...]) -> wp.Kernel:
 
 
 @cache
-def face(real, grips: tuple[Hook, ...], steers: tuple[Hook, ...]) -> wp.Kernel:
+def face(real, grips: tuple[Hook, ...], steers: tuple[Hook, ...], aheads: tuple[Hook, ...]) -> wp.Kernel:
     """Kernel: distance of nodes from what is gripped, and the velocity imposed there."""
     vec3, vec4 = vector(real), vector4(real)
     count = len(grips)
     functions, a, b, _ = columns_of(steers)
+    said, said_a, _, said_rows = columns_of(aheads)
+    said_count = len(aheads)
+    rows = [grip.boundary for grip in grips]
+    said_place = tuple(rows.index(row) for row in said_rows)  # among the grips
+    by_share = tuple(real(0.0 if row in said_rows else 1.0) for row in rows)
     distance = _distance(real)
 
     @wp.kernel(module="unique")
@@ -119,18 +126,19 @@ def face(real, grips: tuple[Hook, ...], steers: tuple[Hook, ...]) -> wp.Kernel:
         ny, nz = window[4], window[5]
         nodes = window[3] * ny * nz
         at = wp.vec3i(window[0] + n / (ny * nz), window[1] + (n / nz) % ny, window[2] + n % nz)
-        held, most = real(0.0), real(0.0)
+        held, shared, most = real(0.0), real(0.0), real(0.0)
         owner = -1
         for h in range(wp.static(count)):
             mine = gripped[h * nodes + n]
             held = held + mine
+            shared = shared + wp.static(by_share[h]) * mine
             if mine > most:
                 most = mine
                 owner = h
         s = real(1.5)
         total = grid[n][3] + held
-        if held > real(0.0) and total > mass_floor:
-            s = distance(held / total)
+        if shared > real(0.0) and total > mass_floor:
+            s = distance(shared / total)
         if owner < 0:
             # whoever follows this node has the motion of a grip nearby
             for k in range(12):
@@ -143,6 +151,9 @@ def face(real, grips: tuple[Hook, ...], steers: tuple[Hook, ...]) -> wp.Kernel:
                             owner = h
         v = vec3()
         x = origin + dx * vec3(real(at[0]), real(at[1]), real(at[2]))
+        for k in range(wp.static(said_count)):
+            if gripped[wp.static(said_place[k]) * nodes + n] > real(0.0):
+                s = wp.min(s, wp.max(wp.static(said[k])(x, q, wp.static(said_a[k])) / dx, real(-1.5)))
         for h in range(wp.static(count)):
             if owner == h:
                 v, _ = wp.static(functions[h])(x, q, wp.static(a[h]), clock, row[0], wp.static(b[h]))

@@ -4,6 +4,7 @@
     touch   does a particle reach the boundary? its `node` then acts only on the nodes of those that do
     node    velocity of a grid node -> velocity of that node                 (walls, colliders)
     grip    how much of a selected particle is gripped now, and has no part in the dynamics (`hold`)
+    ahead   how far a place is before the face of what is gripped, where the boundary knows; else shares of mass tell
     steer   the velocity and its gradient imposed on what is gripped
 
 A kernel is made for the hooks of a scene, in the order of its boundaries; scenes with equal hooks share it. Only the
@@ -39,6 +40,7 @@ class Hooks:
     touch: tuple[Hook, ...] = ()
     node: tuple[Hook, ...] = ()
     grip: tuple[Hook, ...] = ()
+    ahead: tuple[Hook, ...] = ()  # for some grips
     steer: tuple[Hook, ...] = ()  # one for each grip
     signals: int = 0  # of all boundaries together
 
@@ -49,6 +51,7 @@ def hooks_of(boundaries: Sequence[AbstractBoundary], widths: Sequence[int], real
     touch: list[Hook] = []
     node: list[Hook] = []
     grip: list[Hook] = []
+    ahead: list[Hook] = []
     steer: list[Hook] = []
     parameter, signal = 0, FIRST_SIGNAL
     for row, (boundary, width) in enumerate(zip(boundaries, widths, strict=True)):
@@ -57,6 +60,7 @@ def hooks_of(boundaries: Sequence[AbstractBoundary], widths: Sequence[int], real
             (touch, boundary.touch(real)),
             (node, boundary.node(real)),
             (grip, boundary.grip(real)),
+            (ahead, boundary.ahead(real)),
             (steer, boundary.steer(real)),
         ):
             if function is not None:
@@ -67,6 +71,7 @@ def hooks_of(boundaries: Sequence[AbstractBoundary], widths: Sequence[int], real
         touch=tuple(touch),
         node=tuple(node),
         grip=tuple(grip),
+        ahead=tuple(ahead),
         steer=tuple(steer),
         signals=signal - FIRST_SIGNAL,
     )

@@ -67,7 +67,7 @@ class Substeps:
             self.kernels["push"] = push(real, hooks.push)
         if hooks.grip:
             self.kernels["hold"] = hold(real, hooks.grip)
-            self.kernels["face"] = face(real, hooks.grip, hooks.steer)
+            self.kernels["face"] = face(real, hooks.grip, hooks.steer, hooks.ahead)
             self.kernels["lead"] = lead(real)
             self.kernels["steer"] = steer(real, hooks.grip, hooks.steer)
         self._launches: dict[tuple[int, int, int], Launches] = {}  # of worker w, from state i to state j

@@ -12,7 +12,7 @@ from physics3d.mpm.rollout import rollout
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_held_particles_of_a_box_are_a_fixed_region(precision):
-    """The nodes nearest to the particles below z = 0.1 m are those up to 0.1 m: the same run, bit by bit."""
+    """Halfway to the particles above those below z = 0.1 m lies z = 0.1 m, the face of the box."""
     position, volume = block((3, 2, 4), 0.1)
     push = torch.tensor((0.3, 0.2, -0.1), dtype=torch.float64)
     below = HeldParticles(position=position[position[:, 2] < 0.1])
@@ -24,7 +24,8 @@ def test_held_particles_of_a_box_are_a_fixed_region(precision):
             ends.append(rollout(world, tensors(world.start), position, volume, **more).position[-1])
     moved = (ends[0] - position).norm(dim=1)
     assert float(moved[position[:, 2] > 0.3].min()) > 1e-3
-    assert torch.equal(ends[0], ends[1])
+    # the box is a thousandth of a cell larger, for nodes on its surface
+    assert float((ends[0] - ends[1]).norm()) < 2e-3 * float((ends[1] - position).norm())
 
 
 @pytest.mark.parametrize("position", [(), ((1.0, 2.0),), ((0.0, 0.0, float("inf")),)], ids=["none", "two", "infinite"])

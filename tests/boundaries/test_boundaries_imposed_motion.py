@@ -40,7 +40,7 @@ def test_what_a_shell_encloses_takes_its_affine_field(deformation, per_cell):
     # of the strain: the mean is the field's, particles sample it
     assert float((found.mean(0) - A).abs().max()) < 0.02 * strain
     assert float((found - A).abs().max()) < 0.15 * strain
-    assert float((motion.position[-1] - target).abs().max()) < 0.02 * strain * 0.5
+    assert float((motion.position[-1] - target).abs().max()) < 0.03 * strain * 0.5
 
 
 def test_gradient_of_the_tables_is_the_derivative():
