@@ -42,7 +42,7 @@ $(ready): pyproject.toml constraints.txt
 	@echo 'setting up .venv (5 to 10 minutes, once): build tools, torch, the rest'
 	@$(pip) pip setuptools wheel
 	@$(pip) torch torchvision
-	@$(pip) --no-build-isolation -e '.[dev,sfm]'
+	@$(pip) --no-build-isolation -e '.[dev,sfm,view,export,dask]'
 	@touch $@
 
 run: $(ready) ## the pipeline on SCENE; what has been computed before is reused
@@ -70,7 +70,7 @@ newest: ## the tests with the newest version of everything, in an environment of
 	@test -x .venv-newest/bin/python || "$$PYTHON" -m venv .venv-newest
 	@$(quietly) .venv-newest/bin/python -m pip install --quiet --upgrade pip setuptools wheel
 	@$(quietly) .venv-newest/bin/python -m pip install --quiet --upgrade --upgrade-strategy eager torch torchvision
-	@$(quietly) .venv-newest/bin/python -m pip install --quiet --upgrade --upgrade-strategy eager --no-build-isolation -e '.[dev,sfm]'
+	@$(quietly) .venv-newest/bin/python -m pip install --quiet --upgrade --upgrade-strategy eager --no-build-isolation -e '.[dev,sfm,view,export,dask]'
 	@OMP_NUM_THREADS=1 .venv-newest/bin/python -m pipeline.words -m pytest -n 2 --dist loadfile
 
 bench: $(ready) bench-speed bench-renderer bench-filling bench-embedding bench-simulation bench-swaying bench-stability bench-segmentation bench-reconstruction bench-motion bench-real ## measurements with plots, into docs/results; one alone: make bench-<name>
