@@ -19,7 +19,6 @@ from torch import Tensor
 from physics3d.boundaries import base, gripped
 from physics3d.warp_types import vector
 
-
 BESIDE = 1.3  # particles so far apart are neighbours [of the least distance from a held one to a free one]
 
 
