@@ -58,21 +58,21 @@ class HeldParticles(base.AbstractBoundary):
         return gripped.still(real)
 
     def _facets(self, setting: base.Setting) -> Float[Tensor, "f 6"]:
-        position = setting.position.detach().double().numpy()
-        mine = self.holds(setting).numpy() > 0
-        if mine.all():
-            return torch.zeros(0, 6, dtype=torch.float64)
+        """Differentiable in the places of the particles."""
+        position, mine = setting.position.double(), self.holds(setting) > 0
         held, free = position[mine], position[~mine]
-        least = cKDTree(free).query(held)[0]
-        spacing = float(least.min())
+        far = position.new_tensor([[0.0, 0.0, 1e9, 0.0, 0.0, 1.0]])  # nothing free anywhere near: all is behind it
+        if not len(free):
+            return far
+        tree, at = cKDTree(free.detach().numpy()), held.detach().numpy()
+        spacing = float(tree.query(at)[0].min())
         facets = []
-        for place, others in zip(held, cKDTree(free).query_ball_point(held, BESIDE * spacing), strict=True):
-            if others:
-                way = (free[others] - place).mean(0)
-                length = float(np.linalg.norm(way))
-                if length > 1e-6 * spacing:
-                    facets.append(np.concatenate([place + way / 2, way / length]))
-        return torch.from_numpy(np.array(facets))
+        for place, others in zip(held, tree.query_ball_point(at, BESIDE * spacing), strict=True):
+            way = (free[others] - place).mean(0) if others else torch.zeros_like(place)
+            length = torch.linalg.norm(way)
+            if length > 1e-6 * spacing:  # free matter on two sides of one particle has no one face with it
+                facets.append(torch.cat([place + way / 2, way / length]))
+        return torch.stack(facets) if facets else far
 
     def _nearest(self, setting: base.Setting) -> np.ndarray:
         """Index of the particle nearest to each position."""
@@ -86,17 +86,22 @@ class HeldParticles(base.AbstractBoundary):
 def _ahead(real: type) -> wp.Function:
     vec3 = vector(real)
 
-    @wp.func(name=f"before_held_particles_{real.__name__}")
-    def ahead(x: vec3, q: wp.array(dtype=real), a: int):
-        found, least = real(-1e30), real(1e30)  # nothing free anywhere near: all is behind
+    @wp.func(name=f"nearest_facet_{real.__name__}")
+    def nearest(x: vec3, q: wp.array(dtype=real), a: int):
+        found, least = a + 1, real(1e30)
         for k in range(int(q[a])):
             at = a + 1 + 6 * k
-            way = x - vec3(q[at], q[at + 1], q[at + 2])
-            near = wp.length_sq(way)
-            if near < least:
-                least = near
-                found = wp.dot(way, vec3(q[at + 3], q[at + 4], q[at + 5]))
+            distance = wp.length_sq(x - vec3(q[at], q[at + 1], q[at + 2]))
+            if distance < least:
+                least = distance
+                found = at
         return found
+
+    # apart from the search: what a loop of unknown length overwrites has no right adjoint
+    @wp.func(name=f"before_held_particles_{real.__name__}")
+    def ahead(x: vec3, q: wp.array(dtype=real), a: int):
+        at = nearest(x, q, a)
+        return wp.dot(x - vec3(q[at], q[at + 1], q[at + 2]), vec3(q[at + 3], q[at + 4], q[at + 5]))
 
     return ahead
 

@@ -68,9 +68,9 @@ def rollout(
 
     coefficients = world.material.coefficients({name: value.double().to(device) for name, value in parameters.items()})
     coefficients = place(coefficients.expand(len(coefficients), n)[:, order])
-    q = [boundary.parameters(setting).to(torch.float64) for boundary in boundaries]
-    # how much of a particle a boundary selects may depend on where it is
+    # where a face lies, and how much of a particle a boundary selects, may depend on where particles are
     there = dataclasses.replace(setting, position=position.double().cpu())
+    q = [boundary.parameters(there).to(torch.float64) for boundary in boundaries]
     selection = [boundary.selection(there) for boundary in boundaries]
     problem = Problem(
         world=world,
