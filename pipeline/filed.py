@@ -1,0 +1,105 @@
+"""What runs of a scene have filed, for the commands that show it or take it elsewhere: nothing is computed here.
+
+The words are those of `make run`, so that what is found is what that command made: of the same scene, profile, method
+and settings, and of the code as it is now.
+"""
+
+import os
+import shlex
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from pipeline.flow import Plan, first, plan
+from pipeline.settings import SettingsError, compose
+from pipeline.stage import StageError, Step, Unknown, damage
+from pipeline.words import literal_paths
+
+DEFAULTS = {"PROFILE": "default", "METHOD": "physics3d", "DATA": "", "ARGS": ""}  # those of the Makefile
+
+
+def filed(words: list[str], *needed: str) -> tuple[dict[str, Any], Plan, dict[str, Step]]:
+    """Configuration, plan, and steps by name, of which those `needed` are whole.
+
+    Raises SettingsError for words that mean nothing, StageError naming the command that computes what is missing.
+    """
+    config, _ = compose(literal_paths(words))
+    shelf = Path(config["output"]).expanduser().resolve() / "artifacts"
+    try:
+        capture = first(config, shelf, ask=False)
+        if damage(capture):
+            raise Unknown
+        whole = plan(config, capture, ask=False)
+        steps = {step.name: step for step in whole.steps}
+        missing = [name for name in needed if name in steps and damage(steps[name])]
+    except Unknown:
+        missing = ["capture"]
+    if missing:
+        raise StageError(
+            f"not computed yet with these settings and this code: {', '.join(missing)}; {command(os.environ)}"
+        )
+    return config, whole, steps
+
+
+def command(environment: Mapping[str, str]) -> str:
+    """The `make run` of the same words."""
+    said = [f"SCENE={shlex.quote(environment.get('SCENE') or 'carnation')}"]
+    for name, usual in DEFAULTS.items():
+        value = environment.get(name, usual)
+        if value != usual:
+            said.append(f"{name}={shlex.quote(value)}")
+    return f"make run {' '.join(said)}"
+
+
+def one_line(run: Callable[[], None], error: Callable[[str], None]) -> int:
+    """Exit code of a command: 0 done, 1 it could not be, 2 the words mean nothing, 130 Ctrl-C; errors in one line."""
+    try:
+        run()
+    except SettingsError as wrong:
+        error(f"error: {wrong}")
+        return 2
+    except (StageError, ValueError, RuntimeError, OSError) as wrong:
+        error(f"error: {' '.join(str(wrong).split())}")
+        return 1
+    except KeyboardInterrupt:
+        error("\ninterrupted; nothing was left")
+        return 130
+    return 0
+
+
+@contextmanager
+def beside(target: Path, size: int = 0) -> Iterator[Path]:
+    """A hidden path beside `target` to write a file or a folder at; it gets its name when all of it is there.
+
+    `size` [byte] of what will be written. Raises FileExistsError if `target` is there already, OSError if the disk has
+    not as much room; whatever goes wrong, nothing is left.
+    """
+    if os.path.lexists(target):
+        raise FileExistsError(f"{target} is there already; remove it, or say OUT=<another place>")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    free = shutil.disk_usage(target.parent).free
+    if size > free:
+        raise OSError(
+            f"the disk is full: {megabytes(size)} are needed, {megabytes(free)} are free in {target.parent}; free some "
+            "space, or say OUT=<a place on another disk>"
+        )
+    hidden = target.with_name(f".{target.stem}.unfinished{target.suffix}")
+    _remove(hidden)  # of a command that was killed
+    try:
+        yield hidden
+        hidden.rename(target)
+    finally:
+        _remove(hidden)
+
+
+def megabytes(size: int) -> str:
+    return f"{size / 1e6:.3g} MB" if size < 1e9 else f"{size / 1e9:.3g} GB"
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
