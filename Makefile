@@ -1,5 +1,6 @@
 # Everything a user does, one line each. Values: make run SCENE=plush PROFILE=smoke DATA=../shared/data ARGS="learn.steps=50"
 SCENE ?= carnation
+chosen := $(filter-out file,$(origin SCENE))
 PROFILE ?= default
 METHOD ?= physics3d
 DATA ?=
@@ -20,7 +21,7 @@ export SCENE PROFILE METHOD DATA ARGS PORT PYTHON REAL PRED OUT FORMAT FRAME SIZ
 
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup run score twin export film ui view test newest bench lint architecture clean
+.PHONY: help setup run score twin export film report ui view test newest bench lint architecture clean
 py := .venv/bin/python
 # torch's own threads spin beside those of the renderer and the simulator: OMP_NUM_THREADS=1 unless you say otherwise
 threads := OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1}
@@ -66,6 +67,9 @@ export: $(ready) ## the moving Gaussians for other programs: FORMAT=ply|usd|gltf
 
 film: $(ready) ## the motion from a camera that goes round it: [OUT=<new .mp4>] [SIZE=1280x720] [LENGTH=<seconds>]
 	@$(threads) $(with_args) -m pipeline.film $(of_run)
+
+report: $(ready) ## one HTML page of what SCENE=... left, or, without SCENE, of all runs: [OUT=<new .html>]
+	@$(threads) $(with_args) -m pipeline.web $(if $(chosen),$(of_run))
 
 ui: $(ready) ## MLflow: prints the address of the page that compares runs, and serves it
 	@$(py) -m pipeline.tracking .

@@ -14,28 +14,23 @@ from typing import Any
 
 from pipeline.flow import Plan, first, plan
 from pipeline.settings import SettingsError, compose
-from pipeline.stage import StageError, Step, Unknown, damage
+from pipeline.stage import StageError, Step, damage
 from pipeline.words import literal_paths
 
 DEFAULTS = {"PROFILE": "default", "METHOD": "physics3d", "DATA": "", "ARGS": ""}  # those of the Makefile
 
 
 def filed(words: list[str], *needed: str) -> tuple[dict[str, Any], Plan, dict[str, Step]]:
-    """Configuration, plan, and steps by name, of which those `needed` are whole.
+    """Configuration, plan, and steps by name, of which those `needed`, or all, are whole.
 
     Raises SettingsError for words that mean nothing, StageError naming the command that computes what is missing.
     """
     config, _ = compose(literal_paths(words))
     shelf = Path(config["output"]).expanduser().resolve() / "artifacts"
-    try:
-        capture = first(config, shelf, ask=False)
-        if damage(capture):
-            raise Unknown
-        whole = plan(config, capture, ask=False)
-        steps = {step.name: step for step in whole.steps}
-        missing = [name for name in needed if name in steps and damage(steps[name])]
-    except Unknown:
-        missing = ["capture"]
+    capture = first(config, shelf)
+    whole = Plan([capture]) if damage(capture) else plan(config, capture)
+    steps = {step.name: step for step in whole.steps}
+    missing = [name for name, step in steps.items() if (not needed or name in needed) and damage(step)]
     if missing:
         raise StageError(
             f"not computed yet with these settings and this code: {', '.join(missing)}; {command(os.environ)}"
@@ -70,13 +65,13 @@ def one_line(run: Callable[[], None], error: Callable[[str], None]) -> int:
 
 
 @contextmanager
-def beside(target: Path, size: int = 0) -> Iterator[Path]:
+def beside(target: Path, size: int = 0, over: bool = False) -> Iterator[Path]:
     """A hidden path beside `target` to write a file or a folder at; it gets its name when all of it is there.
 
-    `size` [byte] of what will be written. Raises FileExistsError if `target` is there already, OSError if the disk has
-    not as much room; whatever goes wrong, nothing is left.
+    `size` [byte] of what will be written; `over`: a file that is there is replaced. Raises FileExistsError if `target`
+    is there already, OSError if the disk has not as much room; whatever goes wrong, nothing half-written is left.
     """
-    if os.path.lexists(target):
+    if os.path.lexists(target) and not over:
         raise FileExistsError(f"{target} is there already; remove it, or say OUT=<another place>")
     target.parent.mkdir(parents=True, exist_ok=True)
     free = shutil.disk_usage(target.parent).free

@@ -24,10 +24,14 @@ class SceneMotion:
 
 def scene_motion(words: list[str]) -> SceneMotion:
     """Of the scene that the words of a `make run` name. Raises as `filed`."""
+    config, _, steps = filed(words, "capture", "guess", "reconstruct", "fill", "learn", "simulate")
+    return of_steps(config, steps)
+
+
+def of_steps(config: dict[str, Any], steps: dict[str, Step]) -> SceneMotion:
+    """Raises ArtifactError naming the folder if a result is damaged."""
     from physics3d.log import Log
 
-    needed = ("capture", "guess", "reconstruct", "fill", "learn", "simulate")
-    config, _, steps = filed(words, *needed)
     capture = read(steps["capture"])
     gaussians = read(steps["reconstruct"]) if "reconstruct" in steps else capture.gaussians
     body, trajectory = read(steps["fill"]), read(steps["simulate"])
