@@ -1,7 +1,7 @@
 """The page of all runs whose results lie on a shelf, by scene, and the plots of error against run time.
 
-A run is what a step that judges, or else a video that nobody judged, was made from. Which method and profile that was is
-in MLflow's record; without one, the material and the numbers still say what was done.
+A run is what a step that judges, or else a video that nobody judged, was made from. Which method and profile that was
+is in MLflow's record; without one, the material and the numbers still say what was done.
 """
 
 import re

@@ -258,7 +258,7 @@ def git_commit(root: Path) -> str:
 
 
 def labels(output: Path) -> dict[str, dict[str, str]]:
-    """artifacts/<stage>/<fingerprint> -> scene, method and profile of the newest run that had it; empty if no record."""
+    """artifacts/<stage>/<fingerprint> -> scene, method, profile of the newest run that had it; none without record."""
     query = "select art.value, tag.key, tag.value from tags art join tags parent on parent.run_uuid = art.run_uuid "
     query += "join tags tag on tag.run_uuid = parent.value join runs on runs.run_uuid = parent.value "
     query += "where art.key = 'artifact' and parent.key = 'mlflow.parentRunId' "

@@ -2,20 +2,18 @@
 
 import os
 import re
-import shutil
-import subprocess
 from html.parser import HTMLParser
-from pathlib import Path
 
 import numpy as np
 import pytest
 from moved import moved_configuration, run_all
 from PIL import Image
+from report_picture import chromium, shot
 
 from pipeline import filed, shelf_page, web
 from pipeline.stage import peek
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+CHROMIUM = chromium()
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +95,7 @@ def test_the_page_of_all_runs_has_every_run_once(report, scene, tmp_path):
 def test_a_page_of_our_choice_is_renewed_and_one_of_yours_is_kept(report, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for _ in range(2):
-        code, said, _ = report("scene=toy")
+        code, _, _ = report("scene=toy")
         assert code == 0
     (made,) = (tmp_path / "exports").iterdir()
     code, _, wrong = report("scene=toy", OUT=made)
@@ -116,20 +114,8 @@ def test_no_run_is_one_line(report, scene, tmp_path, monkeypatch):
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium; on Debian: apt install chromium")
 def test_a_browser_shows_the_films_and_the_gaussians(report, tmp_path):
     assert report("scene=toy", OUT=tmp_path / "a.html")[0] == 0
-    shot = tmp_path / "a.png"
-    options = [
-        "--headless=new",
-        "--no-sandbox",
-        "--hide-scrollbars",
-        "--window-size=1200,1000",
-        "--virtual-time-budget=3000",
-    ]
-    address = (tmp_path / "a.html").as_uri()
-    subprocess.run(
-        [str(CHROMIUM), *options, f"--user-data-dir={tmp_path / 'profile'}", f"--screenshot={shot}", address],
-        check=True, capture_output=True, timeout=120,
-    )  # fmt: skip
-    picture = np.asarray(Image.open(shot).convert("RGB"), float)
+    shot(str(CHROMIUM), tmp_path / "a.html", tmp_path / "a.png", width=1200, height=1000)
+    picture = np.asarray(Image.open(tmp_path / "a.png").convert("RGB"), float)
     # colours (the body is coloured, text and page are grey) in the row of films, and below it in the replay
     colour = picture.max(2) - picture.min(2) > 25
     rows = np.flatnonzero(colour[:, :720].sum(1) > 20)
