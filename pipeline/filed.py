@@ -7,7 +7,7 @@ and settings, and of the code as it is now.
 import os
 import shlex
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from pipeline.settings import SettingsError, compose
 from pipeline.stage import StageError, Step, damage
 from pipeline.words import literal_paths
 
-DEFAULTS = {"PROFILE": "default", "METHOD": "physics3d", "DATA": "", "ARGS": ""}  # those of the Makefile
+USUAL = {"scene": "carnation", "profile": "default", "method": "physics3d", "data": ""}  # in the Makefile
 
 
 def filed(words: list[str], *needed: str) -> tuple[dict[str, Any], Plan, dict[str, Step]]:
@@ -32,20 +32,21 @@ def filed(words: list[str], *needed: str) -> tuple[dict[str, Any], Plan, dict[st
     steps = {step.name: step for step in whole.steps}
     missing = [name for name, step in steps.items() if (not needed or name in needed) and damage(step)]
     if missing:
-        raise StageError(
-            f"not computed yet with these settings and this code: {', '.join(missing)}; {command(os.environ)}"
-        )
+        raise StageError(f"not computed yet with these settings and this code: {', '.join(missing)}; {command(words)}")
     return config, whole, steps
 
 
-def command(environment: Mapping[str, str]) -> str:
-    """The `make run` of the same words."""
-    said = [f"SCENE={shlex.quote(environment.get('SCENE') or 'carnation')}"]
-    for name, usual in DEFAULTS.items():
-        value = environment.get(name, usual)
-        if value != usual:
-            said.append(f"{name}={shlex.quote(value)}")
-    return f"make run {' '.join(said)}"
+def command(words: list[str]) -> str:
+    """The `make run` of these words."""
+    values, rest = dict(USUAL), []
+    for word in words:
+        name, _, value = word.partition("=")
+        if name in values:
+            values[name] = value
+        else:
+            rest.append(shlex.quote(word))
+    said = [f"{name.upper()}={shlex.quote(v)}" for name, v in values.items() if name == "scene" or v != USUAL[name]]
+    return " ".join(["make run", *said, *([f"ARGS={shlex.quote(' '.join(rest))}"] if rest else [])])
 
 
 def one_line(run: Callable[[], None], error: Callable[[str], None]) -> int:

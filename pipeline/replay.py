@@ -1,10 +1,12 @@
-"""The moving Gaussians as a few megabytes for a page: places in 16 bits, colours, opacities and widths in 8.
+"""The moving Gaussians as a few megabytes for a page: places in 16 bits; turns, colours, opacities and widths in 8.
 
-Where there are too many, the ones that cover most are kept: opacity times the square of the mean standard deviation,
-which is also the radius of the round spot that the page draws (`pages/replay.js`).
+Where there are too many, the ones that cover most are kept: opacity times the mean square of the standard deviations.
+The page draws them as ellipsoids that turn with the body, as wide as they are at rest, in the colour that they have on
+average over all directions (`pages/replay.js`).
 """
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,29 +15,35 @@ import torch
 from pipeline.embed import raw
 from pipeline.moving import SceneMotion
 
-BYTES = 2_000_000  # of the places of what moves
+BYTES = 2_500_000  # of places and turns of what moves
 STILL = 8000  # Gaussians that never move, at most
 
 
 def replay(made: SceneMotion) -> dict[str, Any]:
-    """What the page is told, its two arrays in base64, and how many Gaussians there are of how many."""
-    from physics3d.gaussians.carry import carry
+    """What the page is told, its arrays in base64, and how many Gaussians there are of how many."""
+    from physics3d.export.moving import Moving
     from physics3d.gaussians.sh import C0
 
     g, which, trajectory = made.gaussians, made.body.embedding.which, made.trajectory
     frames = len(trajectory.position)
-    radius = torch.exp(2 * g.log_scale).mean(1).sqrt()
-    weight = g.opacity * radius**2
+    weight = g.opacity * torch.exp(2 * g.log_scale).mean(1)
     moves = torch.zeros(len(g), dtype=torch.bool)
     moves[which] = True
-    most = max(1, BYTES // (6 * frames))
+    most = max(1, BYTES // (10 * frames))
     moving, still = (_largest(weight, at, count) for at, count in ((moves, most), (~moves, STILL)))
-    X = trajectory.rest_position
-    with torch.no_grad():
-        paths = torch.stack(
-            [carry(g, made.body.embedding, X, x, F)[0] for x, F in zip(trajectory.position, trajectory.deformation)]
-        )
-    seen = paths[:, moving].reshape(-1, 3)
+    row = torch.zeros(len(g), dtype=torch.long)
+    row[which] = torch.arange(len(which))
+    every = made.body.embedding
+    embedding = replace(
+        every,
+        which=torch.arange(len(moving)),
+        neighbours=every.neighbours[row[moving]],
+        weights=every.weights[row[moving]],
+    )
+    plain = replace(g, sh=g.sh[:, :1]).select(moving)  # harmonics would be turned in vain
+    moved = list(Moving(gaussians=plain, embedding=embedding, trajectory=trajectory).frames())
+    paths = torch.stack([frame.mean for frame in moved])
+    seen = paths.reshape(-1, 3)
     centre = (seen.amin(0) + seen.amax(0)) / 2
     reach = float((seen - centre).norm(dim=1).max())
     # what lies far behind would take the precision from what is looked at
@@ -43,9 +51,12 @@ def replay(made: SceneMotion) -> dict[str, Any]:
     places = torch.cat([seen, g.mean[still]]).double()
     lower, size = places.amin(0), (places.amax(0) - places.amin(0)).clamp_min(1e-9)
     shown = torch.cat([moving, still])
-    widest = float(radius[shown].max())
+    wide = g.log_scale[shown].exp()
+    widest = float(wide.max())
     color = (0.5 + C0 * g.sh[shown, 0]).clamp(0, 1)
-    looks = torch.cat([color, g.opacity[shown, None], (radius[shown, None] / widest).sqrt()], 1)
+    looks = torch.cat([color, g.opacity[shown, None], (wide / widest).sqrt()], 1)
+    turns = torch.cat([frame.quaternion for frame in moved] + [g.quaternion[still]])
+    turns = torch.nn.functional.normalize(turns, dim=1)
     azimuth, elevation = _direction(made, centre)
     told = {
         "moving": len(moving),
@@ -65,6 +76,7 @@ def replay(made: SceneMotion) -> dict[str, Any]:
     return {
         "told": told,
         "places": raw(rounded),
+        "turns": raw((turns * 127).round().numpy().astype(np.int8)),
         "looks": raw((looks * 255).round().numpy().astype(np.uint8)),
         "shown": len(shown),
         "all": len(g),

@@ -1,6 +1,5 @@
 """The page of one run of a scene, from what its steps filed."""
 
-import os
 import re
 from typing import Any
 
@@ -23,24 +22,18 @@ def scene_page(words: list[str]) -> tuple[str, str]:
     config, plan, steps = filed(words)
     left = {name: told.told(step) for name, step in steps.items()}
     made = of_steps(config, steps)
-    judged = told.scores(plan)
     name = made.scene
     text = page(
         "scene.html",
         name=name,
-        made_by=command(os.environ),
+        made_by=command(words),
         note=peek(steps["capture"].folder)["note"],
         finished=max(t.manifest["finished"] for t in left.values()),
         films=films(steps),
         replay=replay(made),
-        judged=judged,
+        judged=told.scores(plan),
         units=_units(),
-        slices=[
-            {"name": f"{step}: {key.replace('_', ' ')}", "picture": picture(path)}
-            for step, t in left.items()
-            for key, (path, _) in t.previews.items()
-            if re.sub(r"_\d+$", "", key).endswith(SLICES) and step != "fill"
-        ],
+        slices=_slices(left),
         parameters=told.parameters(plan),
         truth_source=peek(steps["capture"].folder).get("truth_source", ""),
         stages=[_stage(n, t) for n, t in left.items()],
@@ -77,6 +70,17 @@ def films(steps: dict[str, Step]) -> list[dict[str, Any]]:
             frames, fps = read_mp4(path)
             found.append({"name": f"foretold: {path.stem.replace('_', ' ')}", **film(frames.numpy(), fps)})
     return found
+
+
+def _slices(left: dict[str, told.Told]) -> list[dict[str, Any]]:
+    """Space-time slices: of what was judged beside the recording, else of the video."""
+    of = [n for n in told.JUDGES if n in left] or ["render"]
+    return [
+        {"name": f"{step}: {key.replace('_', ' ')}", "picture": picture(path)}
+        for step in of
+        for key, (path, _) in left[step].previews.items()
+        if re.sub(r"_\d+$", "", key).endswith(SLICES)
+    ]
 
 
 def _stage(name: str, t: told.Told) -> dict[str, Any]:

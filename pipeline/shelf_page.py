@@ -31,7 +31,7 @@ def shelf_page(words: list[str]) -> tuple[str, str]:
     output = Path(config["output"]).expanduser().resolve()
     found = runs(output)
     if not found:
-        raise StageError(f"no run has left anything in {output / 'artifacts'} yet; {command({})}")
+        raise StageError(f"no run has left anything in {output / 'artifacts'} yet; {command([])}")
     measured = [cells for run in found for cells in run["rows"].values()]
     metrics = list(dict.fromkeys(m for cells in measured for m, value in cells.items() if value is not None))
     text = page("shelf.html", runs=found, shelf=output / "artifacts", metrics=metrics, units=UNITS, plots=plots())
