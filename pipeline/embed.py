@@ -72,7 +72,7 @@ def curve(points: Sequence[tuple[float, float]], width: int = 240, height: int =
         f'<svg width="{width}" height="{height}" viewBox="0 0 {width} {height}" role="img">'
         f'<line class="axis" x1="0" x2="{width}" y1="{height - 14}" y2="{height - 14}"/>'
         f'<polyline class="curve" points="{path}"/>'
-        + label(0, 10, number(high), "start")
+        + label(0, 10, number(high) if low == high else f"{number(low)} to {number(high)}", "start")
         + label(0, height - 2, number(float(x.min())), "start")
         + label(width, height - 2, number(float(x.max())), "end")
         + label(width, 10, f"last {number(float(y[-1]))}", "end")

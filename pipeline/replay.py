@@ -19,12 +19,14 @@ BYTES = 2_500_000  # of places and turns of what moves
 STILL = 8000  # Gaussians that never move, at most
 
 
-def replay(made: SceneMotion) -> dict[str, Any]:
-    """What the page is told, its arrays in base64, and how many Gaussians there are of how many."""
+def replay(made: SceneMotion) -> dict[str, Any] | None:
+    """What the page is told, arrays in base64, and how many of how many Gaussians it shows; None if none moves."""
     from physics3d.export.moving import Moving
     from physics3d.gaussians.sh import C0
 
     g, which, trajectory = made.gaussians, made.body.embedding.which, made.trajectory
+    if len(which) == 0:
+        return None
     frames = len(trajectory.position)
     weight = g.opacity * torch.exp(2 * g.log_scale).mean(1)
     moves = torch.zeros(len(g), dtype=torch.bool)

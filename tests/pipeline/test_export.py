@@ -1,6 +1,7 @@
 """make export and make film: what was filed goes out whole, or not at all, and every mistake is one line."""
 
 import os
+import shlex
 import shutil
 
 import pytest
@@ -99,13 +100,14 @@ def test_a_disk_that_fills_meanwhile_leaves_nothing(tmp_path):
 
 def test_a_scene_that_was_not_run_names_the_command(scene, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(filed, "compose", lambda words: (scene | {"output": str(tmp_path)}, {}))
-    monkeypatch.setattr(os, "environ", {"SCENE": "a b", "PROFILE": "smoke", "METHOD": "physics3d"})
+    words = ["scene=a b", "profile=smoke", "method=physics3d", "seed=1", "output=it's"]
     for module in (export, film):
-        assert module.main([], {"FORMAT": "ply", "OUT": str(tmp_path / "out")}) == 1
+        assert module.main(words, {"FORMAT": "ply", "OUT": str(tmp_path / "out")}) == 1
         wrong = capsys.readouterr().err
-        assert (
-            "not computed yet" in wrong and "make run SCENE='a b' PROFILE=smoke\n" in wrong and wrong.count("\n") == 1
-        )
+        assert "not computed yet" in wrong and wrong.count("\n") == 1
+        said = shlex.split(wrong.partition("; ")[2])
+        assert said[:4] == ["make", "run", "SCENE=a b", "PROFILE=smoke"]
+        assert shlex.split(said[4].removeprefix("ARGS=")) == ["seed=1", "output=it's"] and len(said) == 5
 
 
 def test_a_film_has_the_size_and_the_length_that_were_asked_for(command, tmp_path):
