@@ -49,14 +49,14 @@ def scene_page(words: list[str]) -> tuple[str, str]:
 
 def films(steps: dict[str, Step]) -> list[dict[str, Any]]:
     """The recorded clip, where there is one, beside what was simulated, per camera; all begin together."""
-    from physics3d.artifact import AbstractArtifact
-    from physics3d.video import read_mp4
+    from physics3d.scenes.base import Capture
+    from physics3d.video import Video, read_mp4
 
-    capture = AbstractArtifact.load(steps["capture"].folder)
+    capture = Capture.load(steps["capture"].folder)
     take = capture.take("evaluate") or capture.take("learn")
     known_cause = take is not None and take.excitation is not None
     videos = {"learned": "render", "start": "render_initial"} if "learn" in steps else {"simulated": "render"}
-    loaded = {n: AbstractArtifact.load(steps[s].folder) for n, s in videos.items() if s in steps}
+    loaded = {n: Video.load(steps[s].folder) for n, s in videos.items() if s in steps}
     found = []
     for i, camera in enumerate(next(iter(loaded.values())).names):
         rows: dict[str, tuple[np.ndarray, float]] = {}
@@ -66,9 +66,9 @@ def films(steps: dict[str, Step]) -> list[dict[str, Any]]:
         rows |= {n: (video.frames[i].numpy(), video.fps) for n, video in loaded.items()}
         found += [{"name": f"{n}, {camera}", **film(frames, fps)} for n, (frames, fps) in rows.items()]
     if "foretell" in steps:  # its clips begin where it begins to foretell
-        for path in sorted((steps["foretell"].folder / "previews").glob("*.mp4")):
+        for path in sorted(steps["foretell"].folder.glob("*.mp4")):
             frames, fps = read_mp4(path)
-            found.append({"name": f"foretold: {path.stem.replace('_', ' ')}", **film(frames.numpy(), fps)})
+            found.append({"name": f"recorded and foretold, {path.stem.replace('_', ' ')}", **film(frames.numpy(), fps)})
     return found
 
 

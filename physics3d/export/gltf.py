@@ -38,10 +38,12 @@ def write_glb(path: Path, gaussians: Gaussians) -> None:
     """Write one frame, z up, as .glb, y up. Raises ValueError if it is not sound, OSError on a full disk."""
     gaussians.check()
     arrays = _attributes(turned(gaussians, Z_UP_TO_Y_UP))
-    views, accessors, offset = [], [], 0
+    views: list[dict[str, Any]] = []
+    accessors: list[dict[str, Any]] = []
+    offset = 0
     for name, array in arrays.items():
         kind = KINDS[array.shape[1] if array.ndim == 2 else 1]
-        accessor = {"bufferView": len(views), "componentType": FLOAT, "count": len(array), "type": kind}
+        accessor: dict[str, Any] = {"bufferView": len(views), "componentType": FLOAT, "count": len(array), "type": kind}
         if name == "POSITION":  # of which alone glTF demands the bounds
             accessor |= {"min": array.min(0).tolist(), "max": array.max(0).tolist()}
         views.append({"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes})
