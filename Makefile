@@ -1,5 +1,6 @@
 # Everything a user does, one line each. Values: make run SCENE=plush PROFILE=smoke DATA=../shared/data ARGS="learn.steps=50"
 SCENE ?= carnation
+chosen := $(filter-out file,$(origin SCENE))
 PROFILE ?= default
 METHOD ?= physics3d
 DATA ?=
@@ -7,16 +8,20 @@ ARGS ?=
 REAL ?=
 PRED ?=
 OUT ?=
+FORMAT ?= ply
+FRAME ?=
+SIZE ?=
+LENGTH ?=
 PORT ?= 5000
 PYTHON ?= python3
 # these may hold anything, quotes, semicolons and dollar signs too: they are taken as they stand, and reach commands by the
 # environment, never as a part of a line that a shell or make reads
-$(foreach name,SCENE PROFILE METHOD DATA ARGS PORT PYTHON REAL PRED OUT,$(eval override $(name) := $$(value $(name))))
-export SCENE PROFILE METHOD DATA ARGS PORT PYTHON REAL PRED OUT
+$(foreach name,SCENE PROFILE METHOD DATA ARGS PORT PYTHON REAL PRED OUT FORMAT FRAME SIZE LENGTH,$(eval override $(name) := $$(value $(name))))
+export SCENE PROFILE METHOD DATA ARGS PORT PYTHON REAL PRED OUT FORMAT FRAME SIZE LENGTH
 
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup run score twin ui view test newest bench lint architecture clean
+.PHONY: help setup run score twin export film report ui view test newest bench lint architecture clean
 py := .venv/bin/python
 # torch's own threads spin beside those of the renderer and the simulator: OMP_NUM_THREADS=1 unless you say otherwise
 threads := OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1}
@@ -25,6 +30,9 @@ ready := .venv/.ready
 # one version of everything, in isolated builds too; sam2 without its optional CUDA extension
 quietly := PIP_DISABLE_PIP_VERSION_CHECK=1 SAM2_BUILD_CUDA=0
 pip := PIP_CONSTRAINT=constraints.txt $(quietly) $(py) -m pip install --quiet
+
+# what names a run, for commands that show what it left
+of_run := scene="$$SCENE" profile="$$PROFILE" method="$$METHOD" $${DATA:+data="$$DATA"}
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):[^#]*## (.*)/  make \1\t\2/' | expand -t 16
@@ -46,13 +54,22 @@ $(ready): pyproject.toml constraints.txt
 	@touch $@
 
 run: $(ready) ## the pipeline on SCENE; what has been computed before is reused
-	@$(threads) $(with_args) -m pipeline scene="$$SCENE" profile="$$PROFILE" method="$$METHOD" $${DATA:+data="$$DATA"}
+	@$(threads) $(with_args) -m pipeline $(of_run)
 
 score: $(ready) ## any two videos compared: REAL=<clip> PRED=<clip> [OUT=<folder>]
 	@$(threads) $(py) -m pipeline.score
 
 twin: $(ready) ## a thing with known material as photographs and clips on disk: OUT=<new folder>
 	@$(threads) $(py) -m pipeline.twin
+
+export: $(ready) ## the moving Gaussians for other programs: FORMAT=ply|usd|gltf [OUT=<new folder>] [FRAME=<of gltf>]
+	@$(threads) $(with_args) -m pipeline.export $(of_run)
+
+film: $(ready) ## the motion from a camera that goes round it: [OUT=<new .mp4>] [SIZE=1280x720] [LENGTH=<seconds>]
+	@$(threads) $(with_args) -m pipeline.film $(of_run)
+
+report: $(ready) ## one HTML page of what SCENE=... left, or, without SCENE, of all runs: [OUT=<new .html>]
+	@$(threads) $(with_args) -m pipeline.web $(if $(chosen),$(of_run))
 
 ui: $(ready) ## MLflow: prints the address of the page that compares runs, and serves it
 	@$(py) -m pipeline.tracking .

@@ -4,10 +4,10 @@ import math
 import sys
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
+from pipeline import told
 from pipeline.flow import Plan
-from pipeline.stage import Step, manifest, peek
+from pipeline.stage import peek
 
 
 def report(plan: Plan, hits: dict[str, bool]) -> dict[str, float]:
@@ -31,41 +31,37 @@ def report(plan: Plan, hits: dict[str, bool]) -> dict[str, float]:
     stages = table("stage", "", "seconds", "memory", "result")
     stages.columns[-1].justify = "left"
     for name, step in steps.items():
-        told = manifest(step)
-        memory = f"{told['peak_rss_bytes'] / 1e9:.1f} GB"
+        left = told.told(step)
+        memory = f"{left.memory / 1e9:.1f} GB"
         stages.add_row(
-            name, "reused" if hits[name] else "computed", f"{told['seconds']:.1f}", memory, str(_near(step.folder))
+            name, "reused" if hits[name] else "computed", f"{left.seconds:.1f}", memory, str(_near(step.folder))
         )
     for name, why in plan.left_out.items():
         stages.add_row(name, "left out", "", "", why)
     console.print(stages)
 
     headline: dict[str, float] = {}
-    truth = peek(steps["capture"].folder)["truth"]
-    start = _parameters(steps["guess"])
-    learned = _parameters(steps["learn"]) if "learn" in steps else None
-    parameters = table("parameter", "start", *(["learned"] if learned else []), *(["truth"] if truth else []))
-    for name, value in start.items():
-        row = [f"{value:.4g}"]
-        if learned:
-            headline[f"learned/{name}"] = learned[name]
-            row.append(f"{learned[name]:.4g}")
-        if truth:
-            row.append(f"{truth[name]:.4g}" if name in truth else "?")
-        parameters.add_row(name, *row)
+    rows = told.parameters(plan)
+    has_learned, has_truth = "learn" in steps, bool(peek(steps["capture"].folder)["truth"])
+    heads = ["parameter", "start", *(["learned"] if has_learned else []), *(["truth"] if has_truth else [])]
+    parameters = table(*heads)
+    for p in rows:
+        row = [f"{p.start:.4g}"]
+        if p.learned is not None:
+            headline[f"learned/{p.name}"] = p.learned
+            row.append(f"{p.learned:.4g}")
+        if has_truth:
+            row.append("?" if p.truth is None else f"{p.truth:.4g}")
+        parameters.add_row(p.name, *row)
     console.print(parameters)
 
-    for judge in ("foretell", "evaluate"):
-        if judge not in steps:
-            continue
-        stored = peek(steps[judge].folder)
-        metrics = list(dict.fromkeys(m for row in stored["values"].values() for m in row))
-        scores = table("score", *metrics)
-        for name, row in stored["values"].items():
-            scores.add_row(name, *("-" if row.get(m) is None else f"{row[m]:.4g}" for m in metrics))
-            headline |= {f"score/{name}/{m}": v for m, v in row.items() if v is not None and math.isfinite(v)}
+    for judged in told.scores(plan):
+        scores = table("score", *judged.metrics)
+        for name, cells in judged.values.items():
+            scores.add_row(name, *("-" if cells.get(m) is None else f"{cells[m]:.4g}" for m in judged.metrics))
+            headline |= {f"score/{name}/{m}": v for m, v in cells.items() if v is not None and math.isfinite(v)}
         console.print(scores)
-        for name, note in stored["notes"].items():
+        for name, note in judged.notes.items():
             console.print(f"{name}: {note}", markup=False)
 
     for video in sorted(steps["render"].folder.glob("*.mp4")):
@@ -75,12 +71,6 @@ def report(plan: Plan, hits: dict[str, bool]) -> dict[str, float]:
         (shelf / ".latest").write_text(f"{folder.relative_to(shelf)}\n")  # so that it holds when the shelf is moved
     console.print(f"previews  {_near(steps['render'].folder / 'previews')}   (make view)", markup=False)
     return headline
-
-
-def _parameters(step: Step) -> dict[str, float]:
-    """Material parameters of a filed Estimate; of a field, the mean over particles."""
-    stored: dict[str, Any] = peek(step.folder, arrays=True)["parameters"]
-    return {name: float(value.mean() if hasattr(value, "mean") else value) for name, value in stored.items()}
 
 
 def _near(path: Path) -> Path:

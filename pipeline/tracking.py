@@ -257,6 +257,22 @@ def git_commit(root: Path) -> str:
         return "none"
 
 
+def labels(output: Path) -> dict[str, dict[str, str]]:
+    """artifacts/<stage>/<fingerprint> -> scene, method, profile of the newest run that had it; none without record."""
+    query = "select art.value, tag.key, tag.value from tags art join tags parent on parent.run_uuid = art.run_uuid "
+    query += "join tags tag on tag.run_uuid = parent.value join runs on runs.run_uuid = parent.value "
+    query += "where art.key = 'artifact' and parent.key = 'mlflow.parentRunId' "
+    query += "and tag.key in ('scene', 'method', 'profile') order by runs.start_time"
+    found: dict[str, dict[str, str]] = {}
+    try:
+        with closing(_connect(output.resolve() / "mlflow.db", "ro")) as record:
+            for artifact, key, value in record.execute(query).fetchall():
+                found.setdefault(artifact, {})[key] = value
+    except sqlite3.Error:
+        pass
+    return found
+
+
 def address(output: Path, port: int = 5000) -> str:
     """The page that compares runs, once `serve` runs."""
     with closing(_connect(output.resolve() / "mlflow.db", "ro")) as record:

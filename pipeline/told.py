@@ -1,0 +1,110 @@
+"""What the steps of a run left for people, read from their folders without torch: for the terminal and for the page."""
+
+import json
+import math
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pipeline.flow import Plan
+from pipeline.stage import Step, manifest, peek
+
+JUDGES = ("foretell", "evaluate")  # steps whose result is a table of scores
+
+
+@dataclass(frozen=True, kw_only=True)
+class Told:
+    """Of one step."""
+
+    step: Step
+    seconds: float
+    memory: int  # largest resident memory of the process [byte]
+    manifest: dict[str, Any]
+    lines: list[str]  # its log
+    numbers: dict[str, float]  # what it measured once
+    curves: dict[str, list[tuple[int, float]]]  # name -> (step, value)
+    previews: dict[str, tuple[Path, int]]  # name -> the last picture of its series, and how many there are
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parameter:
+    name: str
+    start: float
+    learned: float | None = None
+    truth: float | None = None
+    error: float | None = None  # standard error of ln(learned), at least
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table:
+    """Scores: rows and metrics as `physics3d.metrics.scores` names them."""
+
+    step: str
+    values: dict[str, dict[str, float | None]]
+    notes: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def metrics(self) -> list[str]:
+        return list(dict.fromkeys(m for row in self.values.values() for m in row))
+
+
+def told(step: Step) -> Told:
+    """Raises ValueError if the step has not been filed."""
+    stored, folder = manifest(step), step.folder
+    numbers: dict[str, float] = {}
+    curves: dict[str, list[tuple[int, float]]] = {}
+    measured = folder / "metrics.jsonl"
+    for line in measured.read_text().splitlines() if measured.is_file() else ():
+        point = json.loads(line)
+        if point["step"] is None:
+            numbers[point["name"]] = point["value"]
+        elif math.isfinite(point["value"]):
+            curves.setdefault(point["name"], []).append((point["step"], point["value"]))
+    previews: dict[str, tuple[Path, int]] = {}
+    for path in sorted((folder / "previews").glob("*.png")):
+        name = re.sub(r"_\d{5}$", "", path.stem)
+        previews[name] = (path, previews.get(name, (path, 0))[1] + 1)
+    lines = folder / "log.txt"
+    return Told(
+        step=step,
+        seconds=stored["seconds"],
+        memory=stored["peak_rss_bytes"],
+        manifest=stored,
+        lines=lines.read_text().splitlines() if lines.is_file() else [],
+        numbers=numbers,
+        curves={name: points for name, points in curves.items() if len(points) > 1},
+        previews=previews,
+    )
+
+
+def parameters(plan: Plan) -> list[Parameter]:
+    """Of the material: where it started, what was learned and how far that can be trusted, what is true."""
+    steps = {step.name: step for step in plan.steps}
+    truth = peek(steps["capture"].folder)["truth"]
+    learned = means(steps["learn"]) if "learn" in steps else {}
+    errors: dict[str, float] = {}
+    for name, value in (told(steps["learn"]).numbers if "learn" in steps else {}).items():
+        kind, _, names = name.partition("/")
+        if kind == "standard_error":
+            errors |= dict.fromkeys(names.split("+"), value)  # parameters that share one factor
+    return [
+        Parameter(name=name, start=value, learned=learned.get(name), truth=truth.get(name), error=errors.get(name))
+        for name, value in means(steps["guess"]).items()
+    ]
+
+
+def scores(plan: Plan) -> list[Table]:
+    """Of every step that judges."""
+    found = []
+    for step in plan.steps:
+        if step.name in JUDGES:
+            stored = peek(step.folder)
+            found.append(Table(step=step.name, values=stored["values"], notes=stored["notes"]))
+    return found
+
+
+def means(step: Step) -> dict[str, float]:
+    """Material parameters of a filed Estimate; of a field, the mean over particles."""
+    stored: dict[str, Any] = peek(step.folder, arrays=True)["parameters"]
+    return {name: float(value.mean() if hasattr(value, "mean") else value) for name, value in stored.items()}
