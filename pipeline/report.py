@@ -44,12 +44,16 @@ def report(plan: Plan, hits: dict[str, bool]) -> dict[str, float]:
     truth = peek(steps["capture"].folder)["truth"]
     start = _parameters(steps["guess"])
     learned = _parameters(steps["learn"]) if "learn" in steps else None
-    parameters = table("parameter", "start", *(["learned"] if learned else []), *(["truth"] if truth else []))
+    found = peek(steps["learn"].folder).get("intervals", {}) if learned else {}
+    known = ["truth"] if truth else []
+    parameters = table("parameter", "start", *(["learned", "with a probability of 90 %"] if learned else []), *known)
     for name, value in start.items():
         row = [f"{value:.4g}"]
         if learned:
             headline[f"learned/{name}"] = learned[name]
-            row.append(f"{learned[name]:.4g}")
+            row += [f"{learned[name]:.4g}", _between(found[name]) if name in found else "as given"]
+            for side in ("low", "high") if name in found else ():
+                headline[f"{side}/{name}"] = found[name][side]
         if truth:
             row.append(f"{truth[name]:.4g}" if name in truth else "?")
         parameters.add_row(name, *row)
@@ -81,6 +85,12 @@ def _parameters(step: Step) -> dict[str, float]:
     """Material parameters of a filed Estimate; of a field, the mean over particles."""
     stored: dict[str, Any] = peek(step.folder, arrays=True)["parameters"]
     return {name: float(value.mean() if hasattr(value, "mean") else value) for name, value in stored.items()}
+
+
+def _between(found: dict[str, Any]) -> str:
+    """A stored interval for a person."""
+    between = f"between {found['low']:.4g} and {found['high']:.4g}"
+    return between if found["determined"] else f"not determined by this clip; {between}"
 
 
 def _near(path: Path) -> Path:

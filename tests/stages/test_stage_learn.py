@@ -25,7 +25,8 @@ def test_stiffness_is_recovered_and_documented(clip, tmp_path):
     estimate = stage(clip, *bar(), log=Log(tmp_path, quiet=True))
     assert float(estimate.parameters["youngs_modulus"]) == pytest.approx(2e4, rel=0.05)
     assert float(estimate.parameters["poissons_ratio"]) == pytest.approx(0.3)
-    assert len(estimate.history["youngs_modulus"]) == len(estimate.history["loss"]) == 6
+    told = estimate.intervals["youngs_modulus"]
+    assert told.determined and told.low < 2e4 < told.high and list(estimate.intervals) == ["youngs_modulus"]
     for preview in ("parameters", "reference_above_learned"):
         assert (tmp_path / "previews" / f"{preview}.png").stat().st_size > 1000
     text = (tmp_path / "metrics.jsonl").read_text()
@@ -34,7 +35,27 @@ def test_stiffness_is_recovered_and_documented(clip, tmp_path):
         for name in ("parameter/youngs_modulus", "sensitivity/youngs_modulus", "search/loss", "loss_learned")
     )
     estimate.save(tmp_path / "estimate")
-    assert Estimate.load(tmp_path / "estimate").history == estimate.history
+    again = Estimate.load(tmp_path / "estimate")
+    assert again.history == estimate.history and again.intervals == estimate.intervals
+
+
+@pytest.mark.parametrize("work, ways", [
+    ({"search": 3, "steps": 2, "polish": 1}, [0] * 4 + [1] * 3 + [2]),
+    ({"search": 3, "steps": 0}, [0] * 4),
+    ({"steps": 2, "learn_velocity": True}, [1] * 3),
+])  # fmt: skip
+def test_the_curve_ends_where_the_result_is(clip, work, ways):
+    """Whatever was the last thing done, its last point is the estimate, to the float32 that is filed."""
+    estimate = learner(START, ("youngs_modulus",), frames=3, **work)(clip, *bar(), log=Log(None))
+    assert estimate.history["way"] == ways
+    assert {len(curve) for curve in estimate.history.values()} == {len(ways)}
+    assert estimate.history["youngs_modulus"][-1] == pytest.approx(
+        float(estimate.parameters["youngs_modulus"]), rel=1e-6
+    )
+    if "learn_velocity" in work:
+        last = [estimate.history[f"velocity_{axis}"][-1] for axis in "xyz"]
+        assert last == pytest.approx(estimate.velocity.tolist(), rel=1e-6)
+        assert set(estimate.intervals) == {"youngs_modulus", "velocity_x", "velocity_y", "velocity_z"}
 
 
 def test_initial_velocity_moves_towards_the_truth(clip):
