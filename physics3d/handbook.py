@@ -1,12 +1,12 @@
 """What things are made of: values and widths of `conf/handbook.yaml`, and where learning starts by them.
 
-A thing has E, nu, rho and the largest loss factor eta, each with a width: the standard deviation of its logarithm, of nu
-that of ln K/mu. A Maxwell branch of r times the stiffness of the springs that never relax loses at most
+A thing has E, nu, rho and the largest loss factor eta, each with a width: the standard deviation of its logarithm, of
+nu that of ln K/mu. A Maxwell branch of r times the stiffness of the springs that never relax loses at most
 
     eta = r/(2 sqrt(1 + r))      so      r = 2 eta (eta + sqrt(1 + eta^2)),      mu_N = r mu_E,  K_N = r K_E
 
-(Zener's solid, Ferry 1980, ch. 3), shared equally among branches; a Maxwell body alone starts as stiff as the thing. Its
-relaxation time is where the motion is fast or slow, not in what it is made of: the material's own start is kept.
+(Zener's solid, Ferry 1980, ch. 3), shared equally among branches; a Maxwell body alone starts as stiff as the thing.
+Relaxation times go with the motion as much as with what it is made of: the material's own start is kept.
 """
 
 import difflib
@@ -101,8 +101,8 @@ def begin(thing: Thing, names: list[str], part: str = "") -> tuple[dict[str, flo
     found = {name: known[bare] for name in own if (bare := re.sub(r"_[23]$", "", name)) in known}
     if not found:
         raise ValueError(
-            f"scene.thing is {thing.name!r}, but the material has none of {', '.join(known)}; leave out scene.thing, or "
-            "take material=viscoelastic"
+            f"scene.thing is {thing.name!r}, but the material has none of {', '.join(known)}; take scene.thing=null, "
+            "or material=viscoelastic"
         )
     return {part + name: v for name, (v, _) in found.items()}, {part + name: w for name, (_, w) in found.items()}
 

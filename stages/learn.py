@@ -72,8 +72,9 @@ class Learn:
     search_span: Span = 10.0  # ... between 1/span and span, equally spaced in the logarithm
     stay: NotNegative = 0.01  # pull to the start: cost of a factor e, in units of half the loss at the start
     span: Span = 100.0  # a parameter stays within start/span .. start*span
-    # of what is thought likely beforehand around the start: a standard deviation in the logarithm; 2.3 is a factor 10
-    guess_width: Width = 2.3
+    # of what is thought likely beforehand around the start: standard deviations in the logarithm; 2.3 is a factor 10
+    guess_widths: dict[str, Width] = dataclasses.field(default_factory=dict)  # of single parameters
+    guess_width: Width = 2.3  # of the others
     beyond: Beyond = dataclasses.field(default_factory=Beyond)  # widths of what the clip does not show
     largest_gradient: Positive = 3.0  # clip of the global norm, in units of the loss at the start per unit of theta
     zones: Annotated[int, Ge(1), Le(16)] = 4  # of stiffness, where the cause of the motion is unknown
@@ -84,6 +85,7 @@ class Learn:
         at_least_one("learn", "ties", "learn_velocity"),
         NamesOf("learn", "world.start"),
         NamesOf("ties", "world.start"),
+        NamesOf("guess_widths", "world.start"),
     )
 
     def __post_init__(self):
@@ -104,7 +106,8 @@ class Learn:
                 f"capture {capture.name} has no take with role learn; leave out the learning, or record a motion"
             )
         if take.excitation is None:
-            widths = dict(width=self.guess_width, beyond=self.beyond)
+            width = self.guess_widths.get("youngs_modulus", self.guess_width)
+            widths = dict(width=width, beyond=self.beyond)
             told = learned_free(self.world, capture, gaussians, body, zones=self.zones, **widths, log=log)
             self.tell(told.intervals, log)
             return told
@@ -224,7 +227,7 @@ class Learn:
         after = posterior(
             theta.detach().numpy(),
             seen.evidence,
-            before=np.full(len(theta), self.guess_width),
+            before=np.array([self.guess_widths.get(n.split("+")[0], self.guess_width) for n in field.names]),
             beyond=self.beyond.covariance(stiff, fast, seen.push),
             log=log,
         )
