@@ -22,7 +22,7 @@ each: `thing: {stem: stem, petals: petal}`. Then
 - the widths become those of what is thought likely before the clip (`learn.guess_widths`), so that an interval says
   what the clip has added; without a thing a parameter is guessed to a factor 10 (`learn.guess_width`);
 - where `scene.density` is null, the density is that of the thing, and its width that of the interval's
-  (`learn.beyond`). **A density that a scene gives wins**: for scenes that assume one, set `scene.density` to null as well.
+  (`learn.beyond`). **A density that a scene gives wins**: for scenes that assume one, set `scene.density` to null.
 
 Numbers are `value x/ factor`, the factor of one standard deviation of the logarithm; two of three things of that name
 are thought to lie between value/factor and value times factor. For nu the factor is of K/mu, and its range is given.

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from physics3d.learning.free_motion import LIKELY, WIDTH, FreeMotion, Material, Reduced, start, swinging
+from physics3d.learning.free_motion import LIKELY, WIDTH, Material, Reduced, start, swinging
 from physics3d.learning.interval import Beyond, Posterior, log_normal, posterior
 from physics3d.learning.sandwich import Evidence, blocks, correlation_length
 from physics3d.learning.seen_modes import Observed, Sight
@@ -45,8 +45,8 @@ def free_posterior(
     likely = np.concatenate([[0.0, math.log(LIKELY["ratio"]), math.log(LIKELY["time"])], np.zeros(zones)])
     before = np.array([width, WIDTH["ratio"], WIDTH["time"]] + [WIDTH["zone"]] * zones)
 
-    def course(values: np.ndarray) -> tuple[Float[np.ndarray, "t m"], FreeMotion]:
-        """What the flow shows of the best motion with this material."""
+    def course(values: np.ndarray) -> tuple[Float[np.ndarray, "t m"], Material]:
+        """(what the flow shows of the best motion with these numbers, the material of these)."""
         one = Material.of(values if zones else np.concatenate([values, material.zones]))
         motion, _ = start(body, one, clip, reference=reference)
         q = np.stack([motion.at(i / clip.fps) for i in range(len(clip.gram))])
