@@ -26,6 +26,7 @@ from physics3d.checks import (
 )
 from physics3d.filling.body import Body
 from physics3d.filling.in_world import look_ahead
+from physics3d.filling.section import Section
 from physics3d.gaussians.model import Gaussians
 from physics3d.learning.chain import chain_of
 from physics3d.learning.course import Point, history
@@ -112,7 +113,7 @@ class Learn:
             self.tell(told.intervals, log)
             return told
         start = self.world.estimate()
-        look_ahead(body, self.world, take.excitation, log)
+        section = look_ahead(body, self.world, take.excitation, log)
         indices = self.spread(take.footage)
         seconds = int(indices[-1]) / take.fps
         field = self.field(start, speed=self.natural_speed(body, seconds))
@@ -161,7 +162,7 @@ class Learn:
             parameters={name: v.detach().to(torch.float32) for name, v in field.parameters(theta).items()},
             velocity=field.velocity(theta).detach().to(torch.float32),
             history=history(field, course),
-            intervals=self.intervals(field, theta, seen, log),
+            intervals=self.intervals(field, theta, seen, section, log),
         )
         self.report(capture, field, learned, seen, log)
         if log.folder is not None:
@@ -218,8 +219,14 @@ class Learn:
         offsets = np.linspace(-limit, limit, self.search).tolist()
         return search(chain, field, directions, offsets, seed=self.seed, log=log)
 
-    def intervals(self, field: GlobalField, theta: Tensor, seen: Shown, log: Log) -> dict[str, Interval]:
-        """Of every learned number."""
+    def intervals(
+        self, field: GlobalField, theta: Tensor, seen: Shown, section: Section | None, log: Log
+    ) -> dict[str, Interval]:
+        """Of every learned number. `section`: the thinnest beside what is held, by which the grid may be coarser than
+        is usual."""
+        beyond = self.beyond
+        if section is not None and self.world.solver == "grid":
+            beyond = replace(beyond, grid=max(beyond.grid, 2 * section.grid_error(self.world.dx)))
         unit = field.velocity_scale or 1.0
         speed = [float(v) / unit for v in field.velocity(theta)] if field.velocity_scale else []
         stiff = np.array([float(is_stiff(name)) for name in field.names])
@@ -228,7 +235,7 @@ class Learn:
             theta.detach().numpy(),
             seen.evidence,
             before=np.array([self.guess_widths.get(n.split("+")[0], self.guess_width) for n in field.names]),
-            beyond=self.beyond.covariance(stiff, fast, seen.push),
+            beyond=beyond.covariance(stiff, fast, seen.push),
             log=log,
         )
         return intervals(field, after)
