@@ -66,7 +66,7 @@ def test_a_density_that_nobody_gives_is_the_handbooks():
 
 
 def test_what_is_said_elsewhere_wins_over_the_handbook():
-    words = ["material.start.youngs_modulus=7e4", "learn.guess_widths={youngs_modulus: 0.1}"]
+    words = ["material.start.youngs_modulus=7e4", "+learn.guess_widths.youngs_modulus=0.1"]
     config, _ = compose(["scene=carnation", "scene.thing=foam", *words])
     assert config["learn"]["world"]["start"]["youngs_modulus"] == 7e4
     assert config["learn"]["guess_widths"]["youngs_modulus"] == 0.1
