@@ -66,7 +66,7 @@ def _by_the_handbook(config: Any, picked: dict[str, str]) -> None:
         return
     usual = OmegaConf.load(CONF / "material" / f"{picked['material']}.yaml")
     nodes = {key: OmegaConf.to_container(config[key], resolve=False) for key in ("scene", "learn") if config[key]}
-    plain = {"learn": None} | nodes | {"material": {"start": dict(config.material.start)}}
+    plain: dict[str, Any] = {"learn": None, **nodes, "material": {"start": dict(config.material.start)}}
     try:
         fill_in(plain, dict(usual.start), read(CONF / "handbook.yaml"))
     except ValueError as error:

@@ -108,8 +108,9 @@ class Learn:
             )
         if take.excitation is None:
             width = self.guess_widths.get("youngs_modulus", self.guess_width)
-            widths = dict(width=width, beyond=self.beyond)
-            told = learned_free(self.world, capture, gaussians, body, zones=self.zones, **widths, log=log)
+            told = learned_free(
+                self.world, capture, gaussians, body, zones=self.zones, width=width, beyond=self.beyond, log=log
+            )
             self.tell(told.intervals, log)
             return told
         start = self.world.estimate()

@@ -1,5 +1,7 @@
 """Figure of a learning, from the first trial to the result: every parameter and the loss against the step."""
 
+from typing import Any
+
 from physics3d.learning.course import WAYS
 from physics3d.scenes.base import Capture
 from physics3d.world import Estimate
@@ -19,7 +21,9 @@ def curves(capture: Capture, learned: Estimate):
         axis = figure.add_subplot(1, len(names), i + 1)
         for number, way in enumerate(WAYS):
             steps = [step for step, which in enumerate(history["way"]) if which == number]
-            style = dict(ls="", marker=".") if way == "search" else dict(lw=1.5, marker="." if len(steps) == 1 else "")
+            style: dict[str, Any] = (
+                dict(ls="", marker=".") if way == "search" else dict(lw=1.5, marker="." if len(steps) == 1 else "")
+            )
             if steps:
                 axis.plot(steps, [history[name][step] for step in steps], label=way, **style)
         last = len(history["way"]) - 1

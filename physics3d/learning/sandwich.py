@@ -66,8 +66,8 @@ def spread(evidence: Evidence) -> Spread:
     for sums, count in ((c.sum(0), places), (c.sum(1), times)):
         few = np.sqrt(count / np.maximum(count - 1, 0.5))
         parts.append((_positive(outer(sums * few) - B, root), count))
-    freedom = sum(variance(X) ** 2 / np.maximum(count - 1, 1.0) for X, count in parts)
-    total = sum(X for X, _ in parts)
+    freedom = np.sum([variance(X) ** 2 / np.maximum(count - 1, 1.0) for X, count in parts], axis=0)
+    total = np.sum([X for X, _ in parts], axis=0)
     freedom = np.where(freedom > 0, variance(total) ** 2 / np.maximum(freedom, 1e-300), np.inf)
     student = stats.t.ppf(0.5 + CERTAIN / 2, np.maximum(freedom, 1.0)) / NORMAL
     return Spread(B=total, student=student, places=float(places.min()), times=float(times.min()), frames=length)
@@ -94,7 +94,9 @@ def correlation_length(residual: Float[np.ndarray, "n h w"]) -> float:
     h, w = residual.shape[1:]
     size = (2 * h, 2 * w)
     autocorrelation = lambda x: np.fft.irfft2(np.abs(np.fft.rfft2(x, size)) ** 2, size)
-    power = sum(autocorrelation(frame) for frame in residual)
+    power = np.zeros(size)
+    for frame in residual:
+        power += autocorrelation(frame)
     pairs = autocorrelation((np.abs(residual).max(0) > 0).astype(float))
     y, x = np.fft.fftfreq(size[0], 1 / size[0]), np.fft.fftfreq(size[1], 1 / size[1])
     ring = np.round(np.hypot(y[:, None], x[None])).astype(int).ravel()

@@ -112,8 +112,8 @@ def test_a_start_is_told_by_another_clip_of_the_same_thing(rng):
 
 
 def test_intervals_of_a_free_motion_hold_the_truth():
-    """24 clips whose noise lasts for frames, the material sought in each: 90 % intervals of the stiffness and of the
-    damping's two numbers hold the truth in 75 % or more (72 are counted; their sampling error is 4 %)."""
+    """12 clips whose noise lasts for frames, the material sought in each: 90 % intervals of the stiffness and of the
+    damping's two numbers hold the truth in 70 % or more (36 are counted; their sampling error is 5 %)."""
     body = chain(zones=1)
     truth = Material(stiffness=math.log(7.0), zones=np.zeros(1), ratio=math.log(0.4), time=math.log(0.06))
     count = len(body.mass)
@@ -123,7 +123,7 @@ def test_intervals_of_a_free_motion_hold_the_truth():
     f = roots(modal(body, truth)[0], 0.4, 0.06)[0]
     none = Beyond(surface=0.0, grid=0.0, density=0.0, length=0.0)
     hits, widths = 0, []
-    for seed in range(24):
+    for seed in range(12):
         clip, (_, seen) = filmed(body, truth, np.random.default_rng(seed), noise=0.1, memory=0.7)
         last = len(seen) - 1
         material, _ = fit(body, clip, release=0, reference=last, frequency=f[0], log=Log(None))
@@ -144,5 +144,5 @@ def test_intervals_of_a_free_motion_hold_the_truth():
         deviation = np.sqrt(after.covariance.diagonal())
         hits += int((np.abs(away) < NORMAL * deviation).sum())
         widths.append(deviation[0])
-    assert hits >= 0.75 * 72
+    assert hits >= 0.7 * 36
     assert np.median(widths) < 0.3, "and they are narrow where the clip shows the oscillation"
