@@ -167,7 +167,8 @@ class Learn:
         )
         self.report(capture, field, learned, seen, log)
         if log.folder is not None:
-            log.image("parameters", curves(capture, learned))
+            if course:
+                log.image("parameters", curves(capture, learned))
             frames = torch.arange(len(indices))
             with torch.no_grad():
                 view = next(iter(chain.clips))

@@ -76,13 +76,14 @@ def shown(chain: Chain, field: GlobalField, theta: Tensor, *, seed: int, step: f
             score.append((g * change).sum(-1))
             share.append((change**2).sum(-1))
         s, I = np.stack(score, -1), np.stack(share, -1)
-        counts = I.sum((0, 3)) > 1e-6 * max(float(I.sum((0, 3)).max()), 1e-300)
+        # pixels that change at all; all of them where none does, as in a view that looks away
+        whole = I.sum((0, 3))
+        counts = whole > 1e-6 * float(whole.max()) if whole.any() else whole == 0
         t, c = len(g), g.shape[-1]
         residual = (g * counts[..., None]).transpose(0, 3, 1, 2).reshape(t * c, *counts.shape)
-        row, column = np.nonzero(np.ones_like(counts))
-        block, number = blocks(row, column, correlation_length(residual))
-        summed = lambda values, block=block, number=number: np.stack(
-            [[np.bincount(block, f[..., i].ravel(), number) for i in range(k)] for f in values]
+        block, number = blocks(*np.nonzero(counts), correlation_length(residual))
+        summed = lambda values, counts=counts, block=block, number=number: np.stack(
+            [[np.bincount(block, f[counts, i], number) for i in range(k)] for f in values]
         ).transpose(0, 2, 1)
         scores.append(summed(s))
         shares.append(summed(I))

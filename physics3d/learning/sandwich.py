@@ -12,20 +12,23 @@ clusters, Cameron, Gelbach and Miller 2011; X_+ is X without its negative part, 
     B_P = sum_P (sum_T c) (sum_T c)^T,  B_T = sum_T (sum_P c) (sum_P c)^T,  B_PT = sum_PT c c^T
     B   = B_PT + (g_P B_P - B_PT)_+ + (g_T B_T - B_PT)_+
 
-A block of pixels is SIDE correlation lengths wide; a block of frames as long as Andrews (1991) advises for the Bartlett
-kernel and scores that follow an AR(1). Few blocks know their own spread badly: g = n/(n - 1), and the quantiles are
-Student's, with n the effective number of blocks, (sum I)^2/sum I^2 of their shares I of J^T J (Carter, Schnepel and
-Steigerwald 2017), and the degrees of freedom of a sum of variances with n - 1 each (Satterthwaite 1946). With residuals
-independent from pixel to pixel V is s^2 A^-1, orders of magnitude less than the truth in a video.
+A block of pixels is SIDE correlation lengths wide, less where what is seen is smaller than LEAST of them; a block of
+frames as long as Andrews (1991) advises for the Bartlett kernel and scores that follow an AR(1). Few blocks know their
+own spread badly: g = n/(n - 1), and the quantiles are Student's, with n the effective number of blocks, that is
+(sum I)^2/sum I^2 of their shares I of J^T J (Carter, Schnepel and Steigerwald 2017), and the degrees of freedom of a
+sum of variances with n - 1 each (Satterthwaite 1946). With residuals independent from pixel to pixel V is s^2 A^-1,
+orders of magnitude less than the truth in a video.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy import stats
 
-SIDE = 6.0  # of a block of pixels, in correlation lengths: then 7/8 of an exponential correlation is inside, each way
+SIDE = 6.0  # of a block of pixels, in correlation lengths
+LEAST = 3  # blocks along what is seen, however small: one block says nothing
 CERTAIN = 0.9  # share of the truths that an interval is to hold
 NORMAL = float(stats.norm.ppf(0.5 + CERTAIN / 2))  # half width in standard deviations
 
@@ -115,9 +118,11 @@ def correlation_length(residual: Float[np.ndarray, "n h w"]) -> float:
 def blocks(
     row: Int[np.ndarray, " m"], column: Int[np.ndarray, " m"], length: float
 ) -> tuple[Int[np.ndarray, " m"], int]:
-    """(block of each pixel, how many) for residuals of this correlation length [px]."""
-    side = max(1, round(SIDE * length))
-    _, block = np.unique(np.stack([row // side, column // side]), axis=1, return_inverse=True)
+    """(block of each pixel, how many) by the correlation length of residuals [px]; of pixels that count."""
+    extent = max(int(np.ptp(row)), int(np.ptp(column))) + 1
+    side = max(1, min(round(SIDE * length), math.ceil(extent / LEAST)))
+    places = np.stack([(row - row.min()) // side, (column - column.min()) // side])
+    _, block = np.unique(places, axis=1, return_inverse=True)
     return block.reshape(-1), int(block.max()) + 1
 
 
