@@ -21,7 +21,7 @@ export SCENE PROFILE METHOD DATA ARGS PORT PYTHON REAL PRED OUT FORMAT FRAME SIZ
 
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup run score twin export film report ui view test newest bench lint architecture clean
+.PHONY: help setup run score twin export film report ui view test newest bench lint handbook architecture clean
 py := .venv/bin/python
 # torch's own threads spin beside those of the renderer and the simulator: OMP_NUM_THREADS=1 unless you say otherwise
 threads := OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1}
@@ -98,6 +98,9 @@ bench-%: $(ready)
 
 lint: $(ready) ## style and types
 	@$(py) -m ruff check . && $(py) -m ruff format --check . && $(py) -m mypy
+
+handbook: $(ready) ## write docs/handbook.md from conf/handbook.yaml
+	@PYTHONPATH=. $(py) docs/write_handbook.py
 
 architecture: $(ready) ## draw docs/architecture.png and its table from the imports
 	@$(py) docs/draw_architecture.py

@@ -1,5 +1,6 @@
 """What a scene says of its physics, and what learning found out about it."""
 
+import math
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
@@ -20,18 +21,35 @@ PRECISIONS = {"float32": torch.float32, "float64": torch.float64}
 
 
 @dataclass(frozen=True, kw_only=True)
+class Interval:
+    """What is thought of one learned number after the clip: x is normal, where x is the logarithm of the number in its
+    SI unit; of Poisson's ratio that of K/mu; of a velocity the velocity itself [m/s]."""
+
+    mean: float  # of x
+    deviation: float  # standard deviation of x
+    before: float  # the same before the clip
+    low: float  # the number is below with a probability of 5 % [its SI unit]
+    high: float  # and above likewise
+    determined: bool  # whether the clip has at least halved the deviation
+
+
+@dataclass(frozen=True, kw_only=True)
 class Estimate(AbstractArtifact):
     """Material and initial velocity, as given or as learned."""
 
     parameters: dict[str, Tensor]  # physical name -> scalar or one number per particle [p], SI
     velocity: Float[Tensor, "3"]  # of the body at the start [m/s]
     history: dict[str, list[float]] = field(default_factory=dict)  # curves of the learning
+    intervals: dict[str, Interval] = field(default_factory=dict)  # of what was learned, by name; velocity_x, ... too
 
     def check(self) -> None:
         check_old_names(self.parameters)
         for name, value in self.parameters.items():
             require_finite(f"parameter {name}", value)
         require_finite("velocity", self.velocity)
+        for name, found in self.intervals.items():
+            if not (math.isfinite(found.mean) and found.deviation >= 0 and found.low <= found.high):
+                raise ValueError(f"interval of {name} is {found}; it needs a mean, and low <= high")
 
 
 @dataclass(frozen=True, kw_only=True)

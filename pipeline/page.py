@@ -31,6 +31,7 @@ USED_BY_STAGES = {  # entries that stages take over; those of a class are checke
     "scene": [
         "source",
         "camera_distance",
+        "thing",
         "prompts",
         "density",
         "dx",

@@ -43,13 +43,14 @@ def report(plan: Plan, hits: dict[str, bool]) -> dict[str, float]:
     headline: dict[str, float] = {}
     rows = told.parameters(plan)
     has_learned, has_truth = "learn" in steps, bool(peek(steps["capture"].folder)["truth"])
-    heads = ["parameter", "start", *(["learned"] if has_learned else []), *(["truth"] if has_truth else [])]
+    heads = ["parameter", "start", *(["learned", "with a probability of 90 %"] if has_learned else []), *(["truth"] if has_truth else [])]
     parameters = table(*heads)
     for p in rows:
         row = [f"{p.start:.4g}"]
         if p.learned is not None:
             headline[f"learned/{p.name}"] = p.learned
-            row.append(f"{p.learned:.4g}")
+            headline |= {f"{side}/{p.name}": v for side, v in (("low", p.low), ("high", p.high)) if v is not None}
+            row += [f"{p.learned:.4g}", p.between]
         if has_truth:
             row.append("?" if p.truth is None else f"{p.truth:.4g}")
         parameters.add_row(p.name, *row)

@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 from typing import Any, cast
 
+from physics3d.handbook import fill_in, read
 from pipeline.fields import Unknown, declared
 from pipeline.fingerprint import ROOT
 from pipeline.page import nearest, problem, set_by
@@ -42,6 +43,7 @@ def compose(words: list[str]) -> tuple[dict[str, Any], dict[str, str]]:
             picked = {g: config.hydra.runtime.choices[g] for g in GROUPS if g in config.hydra.runtime.choices}
             OmegaConf.set_struct(config, False)
             del config["hydra"]
+            _by_the_handbook(config, picked)
             written = OmegaConf.to_container(config, resolve=False)
             composed = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))
         except (HydraException, OmegaConfBaseException) as error:
@@ -54,6 +56,26 @@ def compose(words: list[str]) -> tuple[dict[str, Any], dict[str, str]]:
     if wrong:
         raise SettingsError(wrong)
     return composed, picked
+
+
+def _by_the_handbook(config: Any, picked: dict[str, str]) -> None:
+    """What `scene.thing` says, put into a composed configuration. Raises SettingsError."""
+    from omegaconf import OmegaConf
+
+    if OmegaConf.select(config, "scene.thing") is None:
+        return
+    usual = OmegaConf.load(CONF / "material" / f"{picked['material']}.yaml")
+    nodes = {key: OmegaConf.to_container(config[key], resolve=False) for key in ("scene", "learn") if config[key]}
+    plain: dict[str, Any] = {"learn": None, **nodes, "material": {"start": dict(config.material.start)}}
+    try:
+        fill_in(plain, dict(usual.start), read(CONF / "handbook.yaml"))
+    except ValueError as error:
+        raise SettingsError(str(error)) from error
+    config.material.start = plain["material"]["start"]
+    config.scene.density = plain["scene"]["density"]
+    if plain["learn"]:
+        config.learn.guess_widths = plain["learn"]["guess_widths"]
+        config.learn.beyond.density = plain["learn"]["beyond"]["density"]
 
 
 def _check_word(word: str) -> None:

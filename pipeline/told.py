@@ -33,7 +33,17 @@ class Parameter:
     start: float
     learned: float | None = None
     truth: float | None = None
-    error: float | None = None  # standard error of ln(learned), at least
+    low: float | None = None  # the number is below with a probability of 5 %
+    high: float | None = None  # and above likewise
+    determined: bool = True  # whether the clip has at least halved what was unknown before
+
+    @property
+    def between(self) -> str:
+        """The interval in words; of what was not learned, that."""
+        if self.learned is None or self.low is None or self.high is None:
+            return "as given"
+        words = f"between {self.low:.4g} and {self.high:.4g}"
+        return words if self.determined else f"not determined by this clip; {words}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,13 +93,10 @@ def parameters(plan: Plan) -> list[Parameter]:
     steps = {step.name: step for step in plan.steps}
     truth = peek(steps["capture"].folder)["truth"]
     learned = means(steps["learn"]) if "learn" in steps else {}
-    errors: dict[str, float] = {}
-    for name, value in (told(steps["learn"]).numbers if "learn" in steps else {}).items():
-        kind, _, names = name.partition("/")
-        if kind == "standard_error":
-            errors |= dict.fromkeys(names.split("+"), value)  # parameters that share one factor
+    intervals = peek(steps["learn"].folder).get("intervals", {}) if "learn" in steps else {}
+    sides = lambda name: {key: intervals[name][key] for key in ("low", "high", "determined")} if name in intervals else {}
     return [
-        Parameter(name=name, start=value, learned=learned.get(name), truth=truth.get(name), error=errors.get(name))
+        Parameter(name=name, start=value, learned=learned.get(name), truth=truth.get(name), **sides(name))
         for name, value in means(steps["guess"]).items()
     ]
 

@@ -49,7 +49,7 @@ class Foretell:
         """Rows are "take: prediction". Raises ValueError as `swung` does."""
         require_fields(self, "foretell")
         ready = swung(self.world, capture, gaussians, body, zones=self.zones, log=log)
-        clip, flow, _, release = first_take(ready, log)
+        clip, flow, _, _, release = first_take(ready, log)
         learned = material_of(self.world, estimate, ready.reduced.zone)
         before = material_of(self.world, self.world.estimate(), ready.reduced.zone)
         take, posed = ready.take, ready.take.posed
@@ -95,7 +95,7 @@ class Foretell:
         if seen - release < 4:
             notes[take.name] = f"{len(frames)} frames, free from {release} on, are too few to be foretold"
             return {}
-        clip, flow = observe(ready.sight, frames[:seen], take.fps, reference=ready.picture)
+        clip, flow, _ = observe(ready.sight, frames[:seen], take.fps, reference=ready.picture)
         motions = {
             name: start(
                 ready.reduced,

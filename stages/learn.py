@@ -1,6 +1,7 @@
 """Particles + video prior -> material: score distillation through renderer and simulator
 (`physics3d/learning/fit.py`)."""
 
+import dataclasses
 import math
 from dataclasses import dataclass, replace
 from typing import Annotated, Literal
@@ -25,12 +26,15 @@ from physics3d.checks import (
 )
 from physics3d.filling.body import Body
 from physics3d.filling.in_world import look_ahead
+from physics3d.filling.section import Section
 from physics3d.gaussians.model import Gaussians
 from physics3d.learning.chain import chain_of
+from physics3d.learning.course import Point, history
 from physics3d.learning.curves import curves
-from physics3d.learning.fields import GlobalField, physical
+from physics3d.learning.fields import AXES, GlobalField, physical
 from physics3d.learning.fit import fit
-from physics3d.learning.linear import sensitivity
+from physics3d.learning.interval import Beyond, intervals, is_stiff, posterior, words
+from physics3d.learning.linear import Shown, shown
 from physics3d.learning.loss import Chain
 from physics3d.learning.polish import polish
 from physics3d.learning.search import search
@@ -39,9 +43,10 @@ from physics3d.log import Log
 from physics3d.pictures import contact_sheet, to_uint8
 from physics3d.priors.base import AbstractPrior
 from physics3d.scenes.base import Capture, Footage, Outline
-from physics3d.world import Estimate, World
+from physics3d.world import Estimate, Interval, World
 
 Span = Annotated[float, Gt(1), Le(1e12)]  # a factor
+Width = Annotated[float, Gt(0), Le(20)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,6 +73,10 @@ class Learn:
     search_span: Span = 10.0  # ... between 1/span and span, equally spaced in the logarithm
     stay: NotNegative = 0.01  # pull to the start: cost of a factor e, in units of half the loss at the start
     span: Span = 100.0  # a parameter stays within start/span .. start*span
+    # of what is thought likely beforehand around the start: standard deviations in the logarithm; 2.3 is a factor 10
+    guess_widths: dict[str, Width] = dataclasses.field(default_factory=dict)  # of single parameters
+    guess_width: Width = 2.3  # of the others
+    beyond: Beyond = dataclasses.field(default_factory=Beyond)  # widths of what the clip does not show
     largest_gradient: Positive = 3.0  # clip of the global norm, in units of the loss at the start per unit of theta
     zones: Annotated[int, Ge(1), Le(16)] = 4  # of stiffness, where the cause of the motion is unknown
     device: Device = "cpu"
@@ -77,6 +86,7 @@ class Learn:
         at_least_one("learn", "ties", "learn_velocity"),
         NamesOf("learn", "world.start"),
         NamesOf("ties", "world.start"),
+        NamesOf("guess_widths", "world.start"),
     )
 
     def __post_init__(self):
@@ -97,9 +107,14 @@ class Learn:
                 f"capture {capture.name} has no take with role learn; leave out the learning, or record a motion"
             )
         if take.excitation is None:
-            return learned_free(self.world, capture, gaussians, body, zones=self.zones, log=log)
+            width = self.guess_widths.get("youngs_modulus", self.guess_width)
+            told = learned_free(
+                self.world, capture, gaussians, body, zones=self.zones, width=width, beyond=self.beyond, log=log
+            )
+            self.tell(told.intervals, log)
+            return told
         start = self.world.estimate()
-        look_ahead(body, self.world, take.excitation, log)
+        section = look_ahead(body, self.world, take.excitation, log)
         indices = self.spread(take.footage)
         seconds = int(indices[-1]) / take.fps
         field = self.field(start, speed=self.natural_speed(body, seconds))
@@ -121,11 +136,11 @@ class Learn:
             f"{len(chain.clips)} camera(s), {len(body.position)} particles"
         )
         theta = field.zero()
+        course: list[Point] = []
         if self.search:
-            theta = self.searched(chain, field, log)
-        history: dict[str, list[float]] = {}
+            theta, course = self.searched(chain, field, log)
         if self.steps:
-            theta, history = fit(
+            theta, descent = fit(
                 chain,
                 field,
                 theta,
@@ -138,17 +153,22 @@ class Learn:
                 seed=self.seed,
                 log=log,
             )
+            course += descent
         if self.polish:
-            theta = polish(chain, field, theta, steps=self.polish, stay=self.stay, seed=self.seed, log=log)
+            theta, polished = polish(chain, field, theta, steps=self.polish, stay=self.stay, seed=self.seed, log=log)
+            course += polished
+        seen = shown(chain, field, theta, seed=self.seed)
         learned = replace(
             start,
             parameters={name: v.detach().to(torch.float32) for name, v in field.parameters(theta).items()},
             velocity=field.velocity(theta).detach().to(torch.float32),
-            history=self.history(field, history),
+            history=history(field, course),
+            intervals=self.intervals(field, theta, seen, section, log),
         )
-        self.report(capture, chain, field, theta, log)
+        self.report(capture, field, learned, seen, log)
         if log.folder is not None:
-            log.image("parameters", curves(capture, learned.history))
+            if course:
+                log.image("parameters", curves(capture, learned))
             frames = torch.arange(len(indices))
             with torch.no_grad():
                 view = next(iter(chain.clips))
@@ -191,38 +211,56 @@ class Learn:
         size = body.position.amax(0) - body.position.amin(0)
         return float(size.norm()) / seconds
 
-    def searched(self, chain: Chain, field: GlobalField, log: Log) -> Tensor:
+    def searched(self, chain: Chain, field: GlobalField, log: Log) -> tuple[Tensor, list[Point]]:
         """The best of the factors on all moduli together; the start if no modulus is learned, which is said."""
         directions = torch.tensor([float(name.split("+")[0].endswith("modulus")) for name in field.names]).double()
         if not directions.any():
             log.info(f"no coarse search over the stiffness: no modulus is learned, only {', '.join(field.names)}")
-            return field.zero()
+            return field.zero(), []
         limit = math.log(self.search_span)
         offsets = np.linspace(-limit, limit, self.search).tolist()
         return search(chain, field, directions, offsets, seed=self.seed, log=log)
 
-    def history(self, field: GlobalField, history: dict[str, list[float]]) -> dict[str, list[float]]:
-        """Components of theta -> physical values per step."""
-        if not history:
-            return {}
-        thetas = torch.tensor([history[name] for name in field.names], dtype=torch.float64).T
-        values = [physical(field, theta) for theta in thetas]
-        return {"loss": history["loss"], "gradient": history["gradient"]} | {
-            n: [v[n] for v in values] for n in values[0]
-        }
+    def intervals(
+        self, field: GlobalField, theta: Tensor, seen: Shown, section: Section | None, log: Log
+    ) -> dict[str, Interval]:
+        """Of every learned number. `section`: the thinnest beside what is held, by which the grid may be coarser than
+        is usual."""
+        beyond = self.beyond
+        if section is not None and self.world.solver == "grid":
+            beyond = replace(beyond, grid=max(beyond.grid, 2 * section.grid_error(self.world.dx)))
+        unit = field.velocity_scale or 1.0
+        speed = [float(v) / unit for v in field.velocity(theta)] if field.velocity_scale else []
+        stiff = np.array([float(is_stiff(name)) for name in field.names])
+        fast = np.array([0.0] * len(field.groups) + speed)
+        after = posterior(
+            theta.detach().numpy(),
+            seen.evidence,
+            before=np.array([self.guess_widths.get(n.split("+")[0], self.guess_width) for n in field.names]),
+            beyond=beyond.covariance(stiff, fast, seen.push),
+            log=log,
+        )
+        return intervals(field, after)
 
-    def report(self, capture: Capture, chain: Chain, field: GlobalField, theta: Tensor, log: Log) -> None:
-        """One line per component: from, to, truth, how visible it is and how far it can be trusted."""
-        seen = sensitivity(chain, field, theta, seed=self.seed)
-        before, after = physical(field, field.zero()), physical(field, theta)
-        for name in field.names:
-            rms, error = seen[name]
-            log.metric(f"sensitivity/{name}", rms)
-            if math.isfinite(error):
-                log.metric(f"standard_error/{name}", error)
+    def report(self, capture: Capture, field: GlobalField, learned: Estimate, seen: Shown, log: Log) -> None:
+        """One line per number: from, to, truth, how visible it is and between what it lies."""
+        before = physical(field, field.zero())
+        after = {name: float(value.mean()) for name, value in learned.parameters.items()}
+        after |= dict(zip(AXES, learned.velocity.tolist()))
+        for name, rms in zip(field.names, seen.rms):
+            log.metric(f"sensitivity/{name}", 255 * float(rms))
             for part in name.split("+"):
                 truth = f", truth {capture.truth[part]:.4g}" if part in capture.truth else ""
                 log.info(
                     f"{part}: {before[part]:.4g} -> {after[part]:.4g}{truth}; a factor e changes the picture by "
-                    f"{rms:.2g} of 255, standard error at least {error:.2g} of a factor e"
+                    f"{255 * float(rms):.2g} of 255"
                 )
+        self.tell(learned.intervals, log)
+
+    def tell(self, told: dict[str, Interval], log: Log) -> None:
+        """The intervals, in words and as metrics."""
+        for name, found in told.items():
+            log.info(f"{name}: {words(found)}")
+            log.metric(f"interval/{name}/low", found.low)
+            log.metric(f"interval/{name}/high", found.high)
+            log.metric(f"interval/{name}/deviation", found.deviation)

@@ -129,7 +129,7 @@ def test_fields_read_from_the_source_are_those_of_the_class(path):
     assert found.rules == getattr(kind, "RULES", ()) and found.ranges == getattr(kind, "RANGES", {})
     for name, hint in found.hints.items():
         # classes of the project have stand-ins, and what only tensors are is left out: their text differs
-        if not re.search(r"Abstract|World|Rates|Sam2|Prompt|Tensor|Any", f"{true[name]} {hint}"):
+        if not re.search(r"Abstract|World|Rates|Beyond|Sam2|Prompt|Tensor|Any", f"{true[name]} {hint}"):
             assert hint == true[name] and get_args(hint) == get_args(true[name]), name
 
 
@@ -219,7 +219,7 @@ ZERO_IS_FINE = re.compile(
     r"(^|\.)(seed|sh_degree|rounds|steps|frames_per_step|views_per_step|polish|search|paint|motion_bucket|branches|view|"
     r"damping|friction|start|stay|ssim_weight|opacity|drop_pieces_below|opacity_weight|scale_weight|noise|noise_strength|"
     r"enclosure|hardening|hardening_modulus|second_modulus|cubic_modulus|viscosity|power_index|checkpoint_bytes|held_out_cameras\.\d+)$|"
-    r"rates\.(?!final)\w+$|blur\.\d$|(positive|negative)\.\d+\.\d$"
+    r"rates\.(?!final)\w+$|beyond\.\w+$|blur\.\d$|(positive|negative)\.\d+\.\d$"
 )
 ENDLESS = re.compile(r"(shear|bulk)_relaxation_time$")
 NULL_IS_FINE = re.compile(

@@ -12,7 +12,7 @@ import torch
 
 from physics3d.boundaries.base import AbstractBoundary, Setting
 from physics3d.filling.body import Body
-from physics3d.filling.section import COARSE, thinnest_section
+from physics3d.filling.section import COARSE, Section, thinnest_section
 from physics3d.log import Log
 from physics3d.world import World
 
@@ -20,8 +20,10 @@ PLACES = ("lower", "upper", "point", "normal", "position", "path", "kind")  # fi
 CELLS = 15  # along the longest side of a body, for it to bend as it should
 
 
-def look_ahead(body: Body, world: World, excitation: tuple[AbstractBoundary, ...], log: Log) -> None:
-    """Say what the world does to the body at rest. Raises ValueError naming field, value and remedy if it cannot be."""
+def look_ahead(body: Body, world: World, excitation: tuple[AbstractBoundary, ...], log: Log) -> Section | None:
+    """Say what the world does to the body at rest, and return its thinnest section beside what is held, if any is.
+
+    Raises ValueError naming field, value and remedy if it cannot be."""
     world.check()
     _check_resolution(body, world)
     everywhere = (math.inf,) * 3
@@ -40,7 +42,7 @@ def look_ahead(body: Body, world: World, excitation: tuple[AbstractBoundary, ...
         except ValueError as missed:
             raise ValueError(f"{missed}; the body lies in {_extent(setting)}") from None
         _say_behind(boundary, setting, log)
-    _say_held(body, world, setting, log)
+    return _say_held(body, world, setting, log)
 
 
 def _check_resolution(body: Body, world: World) -> None:
@@ -68,7 +70,7 @@ def _say_behind(boundary: AbstractBoundary, setting: Setting, log: Log) -> None:
     log.warn(f"{what}, and hang there; move it away from the body by {deepest:.2g} m, or the body from it")
 
 
-def _say_held(body: Body, world: World, setting: Setting, log: Log) -> None:
+def _say_held(body: Body, world: World, setting: Setting, log: Log) -> Section | None:
     held = torch.zeros(len(setting.position), dtype=torch.bool)
     said = []
     attachment = [(b, "where it touches what is static") for b in body.held]
@@ -84,15 +86,16 @@ def _say_held(body: Body, world: World, setting: Setting, log: Log) -> None:
     position, volume = (a.double().cpu().numpy() for a in (body.position, body.volume))
     section = thinnest_section(position, volume, np.asarray(held), body.spacing)
     if section is None:
-        return
+        return None
     if world.solver != "grid":  # modes integrate every section with its second moment, whatever the particles
         log.info(f"on a grid: {section.described(world.dx)}")
-        return
+        return section
     log.metric("held_section_cells", section.cells(world.dx))
     if section.cells(world.dx) < 0.99 * COARSE:  # a section of two cells is two, whatever the rounding
         log.warn(f"{section.described(world.dx)}; take scene.dx <= {section.thickness / COARSE:.2g} m for better")
     else:
         log.info(section.described(world.dx))
+    return section
 
 
 def _named(boundary: AbstractBoundary) -> str:

@@ -1,10 +1,13 @@
 """How theta becomes a motion, a motion a clip, and which clips of a take it is compared with."""
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
+from physics3d.boundaries.base import AbstractBoundary
+from physics3d.boundaries.impulse import Impulse
 from physics3d.filling.body import Body
 from physics3d.gaussians.deform import Backdrop, render_deformed
 from physics3d.gaussians.model import Gaussians
@@ -69,6 +72,20 @@ def chain_of(
         timing = dict(frames=at[-1] + 1, frame_dt=step / take.fps, log=Log(None))
         return motion(part(field.parameters(theta)), velocity=field.velocity(theta), **timing)
 
+    def pushed(theta: Tensor, more: float):
+        stronger = motion_of(
+            replace(world, boundaries=_stronger(world.boundaries, more)),
+            rest,
+            volume,
+            excitation=(*body.held, *_stronger(take.excitation or (), more)),
+            part=part,
+            matter=body.matter,
+            device=device,
+            log=Log(None),
+        )
+        timing = dict(frames=at[-1] + 1, frame_dt=step / take.fps, log=Log(None))
+        return stronger(part(field.parameters(theta)), velocity=field.velocity(theta), **timing)
+
     def render(motion, view: int, frames: Tensor) -> Tensor:
         draw = lambda x, F: (
             render_deformed(
@@ -77,4 +94,16 @@ def chain_of(
         )
         return torch.stack([draw(motion.position[at[i]], motion.deformation[at[i]]) for i in frames.tolist()]).float()
 
-    return Chain(simulate=simulate, render=render, clips=clips, prior=prior)
+    known = (*world.boundaries, *(take.excitation or ()))
+    forced = _stronger(known, 1.0) != known
+    return Chain(simulate=simulate, render=render, clips=clips, prior=prior, pushed=pushed if forced else None)
+
+
+def _stronger(boundaries: tuple[AbstractBoundary, ...], more: float) -> tuple[AbstractBoundary, ...]:
+    """The same with forces exp(more) times as large; motions and accelerations stay."""
+    return tuple(
+        replace(b, force=tuple(math.exp(more) * float(f) for f in b.force))
+        if isinstance(b, Impulse) and b.force is not None and any(map(float, b.force))
+        else b
+        for b in boundaries
+    )

@@ -1,21 +1,41 @@
-"""Figure of a learning: every parameter and the loss against the step, beside the truth where it is known."""
+"""Figure of a learning, from the first trial to the result: every parameter and the loss against the step."""
 
+from typing import Any
+
+from physics3d.learning.course import WAYS
 from physics3d.scenes.base import Capture
+from physics3d.world import Estimate
+
+GAIN = 5.0  # a curve that spans more than this factor is drawn in the logarithm
 
 
-def curves(capture: Capture, history: dict[str, list[float]]):
-    """A figure: every parameter against the step, the truth dashed where it is known, and the loss."""
+def curves(capture: Capture, learned: Estimate):
+    """Trials of the search as dots, descent and polish as lines, the result with its interval, and the truth dashed
+    where it is known."""
     from matplotlib.figure import Figure
 
-    names = [name for name in history if name != "gradient"]
+    history = learned.history
+    names = [name for name in history if name != "way"]
     figure = Figure(figsize=(3.2 * max(1, len(names)), 2.8), layout="constrained")
     for i, name in enumerate(names):
         axis = figure.add_subplot(1, len(names), i + 1)
-        axis.plot(history[name], lw=1.5)
+        for number, way in enumerate(WAYS):
+            steps = [step for step, which in enumerate(history["way"]) if which == number]
+            style: dict[str, Any] = (
+                dict(ls="", marker=".") if way == "search" else dict(lw=1.5, marker="." if len(steps) == 1 else "")
+            )
+            if steps:
+                axis.plot(steps, [history[name][step] for step in steps], label=way, **style)
+        last = len(history["way"]) - 1
+        if name in learned.intervals:
+            found = learned.intervals[name]
+            axis.vlines(last, found.low, found.high, color="0.2", lw=1.0, label="90 %")
+        axis.plot(last, history[name][-1], "o", color="0.2", ms=4)
         if name in capture.truth:
             axis.axhline(capture.truth[name], ls="--", color="0.4", label="truth")
-            axis.legend(frameon=False)
-        if max(history[name]) > 5 * min(history[name]) > 0:
+        if i == 0 or name in capture.truth:
+            axis.legend(frameon=False, fontsize="small")
+        if max(history[name]) > GAIN * min(history[name]) > 0:
             axis.set_yscale("log")
         axis.set(title=name, xlabel="step")
     return figure

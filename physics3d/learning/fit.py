@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from physics3d.learning.course import Point
 from physics3d.learning.fields import GlobalField, physical
 from physics3d.learning.loss import Chain
 from physics3d.log import Log
@@ -32,8 +33,8 @@ def fit(
     largest_gradient: float,
     seed: int,
     log: Log,
-) -> tuple[Float[Tensor, " k"], dict[str, list[float]]]:
-    """Descend from theta. Returns theta and the history (loss, gradient norm and every component per step).
+) -> tuple[Float[Tensor, " k"], list[Point]]:
+    """Descend from theta. Returns theta and where it was at every step, and at the end.
 
     What is returned is the mean of the last quarter of the iterates, or the iterate of lowest loss if that is better
     over all views and frames. Raises ValueError when the gradient stays not finite.
@@ -42,8 +43,8 @@ def fit(
     unit = max(chain.measure(field.zero(), seed), 1e-12)
     theta = field.bound(theta).requires_grad_()
     adam = torch.optim.Adam([theta], lr=learning_rate, betas=(0.8, 0.95))
-    good, retreats, iterates = theta.detach().clone(), 0, []
-    history: dict[str, list[float]] = {name: [] for name in ("loss", "gradient", *field.names)}
+    good, retreats = theta.detach().clone(), 0
+    course: list[Point] = []
     for step in (bar := log.progress(range(steps), "learning")):
         views, frames = (
             some_of(list(chain.clips), views_per_step, generator),
@@ -64,10 +65,8 @@ def fit(
                 theta.copy_((theta + good) / 2)
             continue
         retreats, good = 0, theta.detach().clone()
-        iterates.append(good)
         norm = float(torch.nn.utils.clip_grad_norm_(theta, largest_gradient))
-        for name, value in zip(history, [float(data.detach()) * unit, norm, *good.tolist()]):
-            history[name].append(value)
+        course.append(Point(way="descent", theta=good, loss=float(data.detach()) * unit))
         for name, value in physical(field, good).items():
             log.metric(f"parameter/{name}", value, step)
         log.metric("loss", float(data.detach()) * unit, step)
@@ -79,15 +78,16 @@ def fit(
         adam.step()
         with torch.no_grad():
             theta.copy_(field.bound(theta))
-    mean = torch.stack(iterates[-max(1, len(iterates) // 4) :]).mean(0)
-    best = iterates[min(range(len(iterates)), key=history["loss"].__getitem__)]
+    mean = torch.stack([point.theta for point in course[-max(1, len(course) // 4) :]]).mean(0)
+    best = min(course, key=lambda point: point.loss).theta
     losses = [chain.measure(candidate, seed) for candidate in (mean, best)]
     log.info(
         f"loss over all frames: start {unit:.5g}, mean of last quarter {losses[0]:.5g}, best iterate {losses[1]:.5g}"
     )
     log.metric("loss_start", unit)
     log.metric("loss_learned", min(losses))
-    return (mean if losses[0] <= losses[1] else best), history
+    theta = mean if losses[0] <= losses[1] else best
+    return theta, [*course, Point(way="descent", theta=theta, loss=min(losses))]
 
 
 def some_of(items: list[int], count: int, generator: torch.Generator) -> list[int]:

@@ -127,18 +127,31 @@ def modal(body: Reduced, material: Material) -> tuple[Float[np.ndarray, " k"], F
     return np.maximum(square, 1e-6), shape
 
 
-def start(
+@dataclass(frozen=True, kw_only=True)
+class Swinging:
+    """Least squares for the amplitudes x = (a, b, c) of k modes: |u - J Phi x|^2, Phi = shape times functions."""
+
+    shape: Float[np.ndarray, "m k"]
+    frequency: Float[np.ndarray, " k"]  # [Hz]
+    damping: Float[np.ndarray, " k"]  # [1/s]
+    creep: Float[np.ndarray, " k"]  # [1/s]
+    functions: Float[np.ndarray, "3 k t"]  # of time, less those at the reference
+    gram: Float[np.ndarray, "t k k"]  # sum w J^T J in the shapes
+    normal: Float[np.ndarray, "n n"]  # n = 3 k
+    right: Float[np.ndarray, " n"]
+    ridge: Float[np.ndarray, " n"]  # what holds faint modes near zero
+    square: float  # sum w |u|^2
+
+
+def swinging(
     body: Reduced,
     material: Material,
     clip: Observed,
     *,
     known: Float[np.ndarray, " m"] | None = None,
     reference: float | None = None,
-) -> tuple[FreeMotion, float]:
-    """(the motion that fits a clip best, its cost [px^2]). Time 0 is the first frame of the clip.
-
-    The flow counts from the frame at time `reference` [s], or from a picture of which the amplitudes `known` are given.
-    """
+) -> Swinging:
+    """As `start`."""
     square, shape = modal(body, material)
     f, d, r = roots(square, math.exp(material.ratio), math.exp(material.time))
     t = np.arange(len(clip.gram)) / clip.fps
@@ -153,29 +166,54 @@ def start(
     b = b @ shape
     normal = np.einsum("akt,tkl,blt->akbl", functions, G, functions, optimize=True)
     n = 3 * len(f)
-    normal = normal.reshape(n, n)
-    right = np.einsum("akt,tk->ak", functions, b).reshape(n)
-    seen = float(clip.weight.sum())
     space = np.einsum("mk,mn,nk->k", shape, body.weight, shape) * body.scale**2
     main = int(np.argmax((b**2).sum(0) / np.maximum(np.einsum("tkk->k", G), 1e-30)))
-    ridge = FAINT * np.tile(space * np.maximum(1, square / square[main]), 3) * seen
-    x = np.linalg.solve(normal + np.diag(ridge), right)
-    left = float(square_sum.sum() - 2 * x @ right + x @ normal @ x)
-    a, s, c = x.reshape(3, -1)
-    q = np.einsum("ak,akt->kt", x.reshape(3, -1), functions)
-    loudness = np.sqrt(np.maximum(np.einsum("kt,tkk,kt->k", q, G, q), 0) / seen)
-    motion = FreeMotion(
+    seen = float(clip.weight.sum())
+    return Swinging(
         shape=shape,
         frequency=f,
         damping=d,
         creep=r,
+        functions=functions,
+        gram=G,
+        normal=normal.reshape(n, n),
+        right=np.einsum("akt,tk->ak", functions, b).reshape(n),
+        ridge=FAINT * np.tile(space * np.maximum(1, square / square[main]), 3) * seen,
+        square=float(square_sum.sum()),
+    )
+
+
+def start(
+    body: Reduced,
+    material: Material,
+    clip: Observed,
+    *,
+    known: Float[np.ndarray, " m"] | None = None,
+    reference: float | None = None,
+) -> tuple[FreeMotion, float]:
+    """(the motion that fits a clip best, its cost [px^2]). Time 0 is the first frame of the clip.
+
+    The flow counts from the frame at time `reference` [s], or from a picture of which the amplitudes `known` are given.
+    """
+    swing = swinging(body, material, clip, known=known, reference=reference)
+    x = np.linalg.solve(swing.normal + np.diag(swing.ridge), swing.right)
+    left = float(swing.square - 2 * x @ swing.right + x @ swing.normal @ x)
+    a, s, c = x.reshape(3, -1)
+    q = np.einsum("ak,akt->kt", x.reshape(3, -1), swing.functions)
+    power = np.einsum("kt,tkk,kt->k", q, swing.gram, q)
+    loudness = np.sqrt(np.maximum(power, 0) / float(clip.weight.sum()))
+    motion = FreeMotion(
+        shape=swing.shape,
+        frequency=swing.frequency,
+        damping=swing.damping,
+        creep=swing.creep,
         cosine=a,
         sine=s,
         slow=c,
-        unexplained=left / max(float(square_sum.sum()), 1e-30),
+        unexplained=left / max(swing.square, 1e-30),
         loudness=loudness,
     )
-    return motion, left + float(x @ (ridge * x))
+    return motion, left + float(x @ (swing.ridge * x))
 
 
 def fit(

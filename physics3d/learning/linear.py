@@ -1,13 +1,19 @@
-"""The chain around theta, made linear: code(theta + d) = code + J d, and how well parameters can be told from it."""
+"""The chain around theta, made linear, z0(theta + d) = z0 + J d, and what its pictures say of theta (`Evidence`)."""
 
-import math
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from physics3d.learning.fields import GlobalField
 from physics3d.learning.loss import Chain
+from physics3d.learning.sandwich import Evidence, blocks, correlation_length
+
+STEP = 0.05  # of theta, in differences
 
 
 @dataclass(frozen=True)
@@ -16,49 +22,103 @@ class Linear:
 
     JJ: Tensor  # w J^T J / N [k, k]
     Jr: Tensor  # w J^T (z0 - x0_hat) / N [k]: the SDS gradient
-    rms: Tensor  # of the columns of J [k], colour in 0..1
-    residual: float  # rms of z0 - x0_hat
-    count: int  # numbers in the code
 
 
-def linearise(chain: Chain, field: GlobalField, theta: Tensor, *, seed: int, step: float = 0.05) -> Linear:
+@dataclass(frozen=True, kw_only=True)
+class _Seen:
+    """One view of the motions around theta."""
+
+    videos: list[Float[Tensor, "t h w 3"]]  # of theta, and of each motion beside it
+    J: Float[Tensor, "d k"]  # on the CPU, like r
+    r: Float[Tensor, " d"]  # z0 - x0_hat
+    weight: float  # w
+
+
+def linearise(chain: Chain, field: GlobalField, theta: Tensor, *, seed: int, step: float = STEP) -> Linear:
     """J by forward differences in theta: k + 1 simulations, none of them differentiated."""
-    k, frames = len(theta), torch.arange(len(next(iter(chain.clips.values()))))
-    JJ, Jr, squares, residual, count, pixels = (
-        torch.zeros(k, k).double(),
-        torch.zeros(k).double(),
-        torch.zeros(k),
-        0.0,
-        0,
-        0,
-    )
+    k = len(theta)
+    JJ, Jr = torch.zeros(k, k).double(), torch.zeros(k).double()
+    pixels = sum(clip.numel() for clip in chain.clips.values())
+    for seen in _around(chain, _motions(chain, theta, step), seed, step):
+        JJ, Jr = JJ + seen.weight * seen.J.T @ seen.J, Jr + seen.weight * seen.J.T @ seen.r
+    return Linear(JJ / pixels, Jr / pixels)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shown:
+    """What a chain's pictures say of theta."""
+
+    evidence: Evidence
+    push: Float[np.ndarray, " k"]  # phi: change of the theta that fits with ln of the known forces; 0 without any
+    rms: Float[np.ndarray, " k"]  # change of the code per unit of theta, colour in 0..1
+
+
+def shown(chain: Chain, field: GlobalField, theta: Tensor, *, seed: int, step: float = STEP) -> Shown:
+    """k + 1 simulations, and one more where a known force drives the motion.
+
+    Scores are counted where the pictures are: s(x) = g(x) dvideo(x)/dtheta with g the gradient of the SDS loss by the
+    colours of pixel x, whatever the prior's code.
+    """
+    k = len(theta)
+    motions = _motions(chain, theta, step)
+    if chain.pushed is not None:
+        with torch.no_grad():
+            motions.append(chain.pushed(theta, step))
+    JJ, squares, count = np.zeros((len(motions) - 1,) * 2), np.zeros(len(motions) - 1), 0
+    scores, shares = [], []
+    for seen in _around(chain, motions, seed, step):
+        J = seen.J.numpy()
+        JJ, squares, count = JJ + seen.weight * J.T @ J, squares + (J**2).sum(0), count + len(J)
+        g = _gradient(chain, seen)
+        score, share = [], []
+        for video in seen.videos[1 : k + 1]:
+            change = (video - seen.videos[0]).double().cpu().numpy() / step
+            score.append((g * change).sum(-1))
+            share.append((change**2).sum(-1))
+        s, I = np.stack(score, -1), np.stack(share, -1)
+        # pixels that change at all; all of them where none does, as in a view that looks away
+        whole = I.sum((0, 3))
+        counts = whole > 1e-6 * float(whole.max()) if whole.any() else whole == 0
+        t, c = len(g), g.shape[-1]
+        residual = (g * counts[..., None]).transpose(0, 3, 1, 2).reshape(t * c, *counts.shape)
+        block, number = blocks(*np.nonzero(counts), correlation_length(residual))
+        summed = lambda values, counts=counts, block=block, number=number: np.stack(
+            [[np.bincount(block, f[counts, i], number) for i in range(k)] for f in values]
+        ).transpose(0, 2, 1)
+        scores.append(summed(s))
+        shares.append(summed(I))
+    push = np.linalg.pinv(JJ[:k, :k], hermitian=True) @ JJ[:k, k] if len(JJ) > k else np.zeros(k)
+    evidence = Evidence(JJ=JJ[:k, :k], score=np.concatenate(scores, 1), share=np.concatenate(shares, 1))
+    return Shown(evidence=evidence, push=push, rms=np.sqrt(squares[:k] / max(count, 1)))
+
+
+def _motions(chain: Chain, theta: Tensor, step: float) -> list[Any]:
+    """At theta, and a step beside it in each component."""
     with torch.no_grad():
-        motions = [chain.simulate(t) for t in (theta, *(theta + step * torch.eye(k, dtype=theta.dtype)))]
-        for view, clip in chain.clips.items():
-            codes = [chain.prior.encode(chain.render(motion, view, frames)) for motion in motions]
+        return [chain.simulate(t) for t in (theta, *(theta + step * torch.eye(len(theta), dtype=theta.dtype)))]
+
+
+def _around(chain: Chain, motions: list[Any], seed: int, step: float) -> Iterator[_Seen]:
+    """Every view of them, always with the same noise."""
+    frames = torch.arange(len(next(iter(chain.clips.values()))))
+    for view, clip in chain.clips.items():
+        with torch.no_grad():
+            videos = [chain.render(motion, view, frames) for motion in motions]
+            codes = [chain.prior.encode(video) for video in videos]
             generator = torch.Generator().manual_seed(seed)
             level = chain.prior.level(generator)
             noise = torch.randn(codes[0].shape, generator=generator).to(codes[0])
             condition = chain.prior.condition(clip[0], (clip,))
             estimate = chain.prior.x0_hat(level.alpha * codes[0] + level.sigma * noise, level, condition)
             J = torch.stack([(code - codes[0]).flatten() / step for code in codes[1:]], 1).double().cpu()
-            r, w = (codes[0] - estimate).flatten().double().cpu(), chain.prior.weight(level)
-            JJ, Jr, squares = JJ + w * J.T @ J, Jr + w * J.T @ r, squares + J.square().sum(0)
-            residual, count, pixels = residual + float(r.square().sum()), count + len(r), pixels + clip.numel()
-    return Linear(JJ / pixels, Jr / pixels, (squares / count).sqrt(), math.sqrt(residual / count), count)
+            r = (codes[0] - estimate).flatten().double().cpu()
+        yield _Seen(videos=videos, J=J, r=r, weight=chain.prior.weight(level))
 
 
-def sensitivity(chain: Chain, field: GlobalField, theta: Tensor, *, seed: int) -> dict[str, tuple[float, float]]:
-    """How well each component can be told: name -> (change of the code per unit of theta [rms x 255], error of theta).
-
-    The error is sqrt(diag(s^2 (J^T J)^-1)) with the residual's mean square s^2, as if residuals were independent from
-    pixel to pixel: they are not, so it is a lower bound. Infinite if unobservable.
-    """
-    around = linearise(chain, field, theta, seed=seed)
-    scale = around.rms.clamp_min(1e-12).double()
-    correlation = around.JJ / around.JJ.diagonal().sqrt().clamp_min(1e-12).outer(
-        around.JJ.diagonal().sqrt().clamp_min(1e-12)
-    )
-    variance = torch.linalg.pinv(correlation, hermitian=True).diagonal() / scale**2 * around.residual**2 / around.count
-    error = torch.where(255 * around.rms > 1e-3, variance.clamp_min(0).sqrt(), torch.inf)
-    return {name: (255 * float(r), float(e)) for name, r, e in zip(field.names, around.rms, error)}
+def _gradient(chain: Chain, seen: _Seen) -> Float[np.ndarray, "t h w 3"]:
+    """Of w/2 |encode(video) - x0_hat|^2 by the video."""
+    video = seen.videos[0].detach().clone().requires_grad_()
+    code = chain.prior.encode(video)
+    (code * (seen.weight * seen.r).reshape(code.shape).to(code)).sum().backward()
+    assert video.grad is not None
+    return video.grad.double().cpu().numpy()

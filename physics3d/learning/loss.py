@@ -28,6 +28,8 @@ class Chain:
     ]  # trajectory, view, indices of frames -> clip in 0..1
     clips: dict[int, Float[Tensor, "t h w 3"]]  # view -> recorded clip
     prior: AbstractPrior
+    # theta [k], ln of a factor on every known force -> trajectory; None: no force is known that drives the motion
+    pushed: Callable[[Tensor, float], Any] | None = None
 
     def loss(self, theta: Tensor, views: list[int], frames: Tensor, generator: torch.Generator) -> Tensor:
         """The first term of L, differentiable in theta."""

@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from physics3d.learning.course import Point
 from physics3d.learning.fields import GlobalField
 from physics3d.learning.linear import linearise
 from physics3d.learning.loss import Chain
@@ -12,17 +13,18 @@ from physics3d.log import Log
 
 def polish(
     chain: Chain, field: GlobalField, theta: Tensor, *, steps: int, stay: float, seed: int, log: Log
-) -> Float[Tensor, " k"]:
+) -> tuple[Float[Tensor, " k"], list[Point]]:
     """Levenberg's steps on L: what Adam leaves undone in narrow valleys where one parameter stands in for another.
 
         (J^T J + stay L_0 + m max diag J^T J) d = -(J^T (z0 - x0_hat) + stay L_0 theta)
 
     m grows by 8 on failure and falls by 4 on success. It is the same for all components, so that one which the pictures
-    hardly show moves least.
+    hardly show moves least. Returns theta and where it was after every step.
     """
     unit, m = max(chain.measure(field.zero(), seed), 1e-12), 1e-3
-    total = lambda t: chain.measure(t, seed) + 0.5 * stay * unit * float(t.square().sum())
-    now, around = total(theta), None
+    pulled = lambda t: 0.5 * stay * unit * float(t.square().sum())
+    total = lambda t: chain.measure(t, seed) + pulled(t)
+    now, around, course = total(theta), None, []
     for step in log.progress(range(steps), "polishing"):
         around = around or linearise(chain, field, theta, seed=seed)
         pull = stay * unit
@@ -35,5 +37,6 @@ def polish(
             theta, now, around, m = trial, then, None, m / 4
         else:
             m *= 8
-    log.info(f"polished: loss {chain.measure(theta, seed):.5g}")
-    return theta
+        course.append(Point(way="polish", theta=theta, loss=now - pulled(theta)))
+    log.info(f"polished: loss {now - pulled(theta):.5g}")
+    return theta, course

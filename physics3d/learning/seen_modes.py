@@ -108,8 +108,9 @@ def sight(gaussians: Gaussians, body: Body, camera: Camera, basis: Float[np.ndar
 
 def observe(
     sight: Sight, frames: UInt8[Tensor, "t h w 3"], fps: float, *, reference: UInt8[Tensor, "h w 3"]
-) -> tuple[Observed, Float[np.ndarray, "t h w 2"]]:
-    """(the sums of the frames, the flow) from the picture `reference`, in which the body is where its Gaussians are."""
+) -> tuple[Observed, Float[np.ndarray, "t h w 2"], Float[np.ndarray, "t n"]]:
+    """(the sums of the frames, the flow, the weight of the pixels of the sight) from the picture `reference`, in which
+    the body is where its Gaussians are."""
     video = torch.cat([reference[None], frames])
     u = flow(video)
     weight = trust(video, u)[1:]
@@ -126,4 +127,4 @@ def observe(
         weight=W.sum(1),
         fps=fps,
     )
-    return observed, u
+    return observed, u, W

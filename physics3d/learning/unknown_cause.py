@@ -9,7 +9,9 @@ from torch import Tensor
 from physics3d.filling.body import Body
 from physics3d.gaussians.model import Gaussians
 from physics3d.learning.free_body import estimate, reduced
+from physics3d.learning.free_interval import free_intervals, free_posterior
 from physics3d.learning.free_motion import FreeMotion, Material, Reduced, fit
+from physics3d.learning.interval import Beyond
 from physics3d.learning.seen_modes import Observed, Sight, observe, sight
 from physics3d.log import Log
 from physics3d.modes.model import Model
@@ -65,10 +67,12 @@ def by_its_own_camera(body: Swung, take: Take, gaussians: Gaussians, rides: Body
     return replace(body, sight=seen, picture=take.videos[0][take.posed], take=take)
 
 
-def first_take(body: Swung, log: Log) -> tuple[Observed, Float[np.ndarray, "t h w 2"], Decay, int]:
-    """(sums, flow, free decay and release of the frames seen)."""
+def first_take(
+    body: Swung, log: Log
+) -> tuple[Observed, Float[np.ndarray, "t h w 2"], Float[np.ndarray, "t n"], Decay, int]:
+    """(sums, flow, its weights, free decay and release of the frames seen)."""
     frames = body.take.videos[0][: frames_seen(body.take)]
-    clip, u = observe(body.sight, frames, body.take.fps, reference=body.picture)
+    clip, u, trusted = observe(body.sight, frames, body.take.fps, reference=body.picture)
     where = moving(u)
     if where is None:
         raise ValueError(f"take {body.take.name}: nothing moves in the {len(frames)} frames that are seen")
@@ -80,25 +84,46 @@ def first_take(body: Swung, log: Log) -> tuple[Observed, Float[np.ndarray, "t h 
             f"take {body.take.name}: what moves does not swing; a material is learned from what has been let go"
         )
     log.info(f"free from frame {release} on; largest oscillation {decay.frequency[decay.main()]:.3g} Hz")
-    return clip, u, decay, release
+    return clip, u, trusted, decay, release
 
 
-def learned_free(world: World, capture: Capture, gaussians: Gaussians, body: Body, *, zones: int, log: Log) -> Estimate:
-    """The material, from the frames seen of the first take."""
+def learned_free(
+    world: World,
+    capture: Capture,
+    gaussians: Gaussians,
+    body: Body,
+    *,
+    zones: int,
+    width: float,
+    beyond: Beyond,
+    log: Log,
+) -> Estimate:
+    """The material, from the frames seen of the first take. `width`: of the stiffness that is likely beforehand, in the
+    logarithm; `beyond`: what the frames do not show."""
     ready = swung(world, capture, gaussians, body, zones=zones, log=log)
-    clip, _, decay, release = first_take(ready, log)
+    clip, u, trusted, decay, release = first_take(ready, log)
     main = decay.main()
     assert main is not None and ready.take.posed is not None
+    reference = None if ready.take.at_rest else ready.take.posed
     material, motion = fit(
-        ready.reduced,
-        clip,
-        release=release,
-        reference=None if ready.take.at_rest else ready.take.posed,
-        frequency=float(decay.frequency[main]),
-        log=log,
+        ready.reduced, clip, release=release, reference=reference, frequency=float(decay.frequency[main]), log=log
     )
     report(motion, material, log)
-    return estimate(world, material, ready.reduced.zone)
+    i, j = ready.sight.pixel.T
+    after = free_posterior(
+        ready.reduced,
+        material,
+        clip.window(release, len(clip.gram)),
+        sight=ready.sight,
+        flow=u[release:, i, j].astype(float),
+        weight=trusted[release:],
+        reference=None if reference is None else (reference - release) / clip.fps,
+        width=width,
+        beyond=beyond,
+        log=log,
+    )
+    found = estimate(world, material, ready.reduced.zone)
+    return replace(found, intervals=free_intervals(found, material, after))
 
 
 def report(motion: FreeMotion, material: Material, log: Log) -> None:

@@ -8,7 +8,8 @@ from physics3d.world import Estimate
 
 
 def parameter_errors(estimates: dict[str, Estimate], truth: dict[str, float]) -> dict[str, dict[str, float | None]]:
-    """ "learned: youngs_modulus" -> value, truth, error [%], ln(value/truth); means over particles of a field."""
+    """ "learned: youngs_modulus" -> value, truth, error [%], ln(value/truth), ends of its 90 % interval
+    where it has one; means over particles of a field."""
     table: dict[str, dict[str, float | None]] = {}
     for parameter, true in truth.items():
         for row, estimate in estimates.items():
@@ -21,4 +22,6 @@ def parameter_errors(estimates: dict[str, Estimate], truth: dict[str, float]) ->
                     "error_percent": 100 * (value - true) / abs(true) if true else None,
                     "log_ratio": math.log(value / true) if positive else None,
                 }
+                if found := estimate.intervals.get(parameter):
+                    table[f"{row}: {parameter}"] |= {"low": found.low, "high": found.high}
     return table

@@ -11,6 +11,7 @@ UNITS = {
     "flow_error": "flow error", "frequency": "frequency [Hz]", "damping": "damping [1/s]",
     "phase": "phase [deg]",
     "value": "value", "truth": "truth", "error_percent": "error [%]", "log_ratio": "ln(value/truth)",
+    "low": "5 % below", "high": "5 % above",
 }  # fmt: skip
 
 

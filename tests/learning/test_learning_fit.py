@@ -1,5 +1,7 @@
 """The chain theta -> motion -> video -> prior -> gradient, and the descent."""
 
+import math
+
 import pytest
 import torch
 from small_scene import DAMPED, bar, bar_chain, cameras, capture, world
@@ -10,7 +12,7 @@ from physics3d.gaussians.splat import Numerics
 from physics3d.gaussians.twin import rasterize_plainly
 from physics3d.learning.fields import GlobalField
 from physics3d.learning.fit import fit, some_frames
-from physics3d.learning.linear import linearise, sensitivity
+from physics3d.learning.linear import linearise, shown
 from physics3d.learning.loss import Chain
 from physics3d.learning.polish import polish
 from physics3d.learning.search import search
@@ -118,10 +120,11 @@ def test_gradient_of_the_whole_chain_is_that_of_central_differences(poked):
 
 def test_descent_finds_the_truth_from_random_frames_and_views_and_leaves_the_unseen_alone():
     chain, field = toy()
-    theta, history = fit(chain, field, field.zero(), **OPTIONS)
+    theta, course = fit(chain, field, field.zero(), **OPTIONS)
     assert float(field.parameters(theta)["youngs_modulus"]) == pytest.approx(0.4, rel=0.01)  # noiseless, 40 steps
     assert float(field.parameters(theta)["unseen"]) == 1.0
-    assert len(history["loss"]) == 40 and history["loss"][-1] < 0.01 * history["loss"][0]
+    assert len(course) == 41 and course[-1].loss < 0.01 * course[0].loss, "every step, and the result"
+    assert torch.equal(course[-1].theta, theta)
 
 
 def test_same_seed_same_path():
@@ -151,7 +154,7 @@ def test_search_steps_over_a_period_that_descent_cannot():
     alone = far.parameters(fit(chain, far, far.zero(), **OPTIONS)[0])["youngs_modulus"]
     assert abs(float(alone) / 0.4 - 1) > 0.2
     directions = torch.tensor([1.0, 0.0], dtype=torch.float64)
-    start = search(chain, far, directions, torch.linspace(-3, 3, 13).tolist(), seed=0, log=Log(None))
+    start, _ = search(chain, far, directions, torch.linspace(-3, 3, 13).tolist(), seed=0, log=Log(None))
     assert float(start[1]) == 0
     found = far.parameters(fit(chain, far, start, **OPTIONS)[0])["youngs_modulus"]
     assert float(found) == pytest.approx(0.4, rel=0.01)
@@ -187,7 +190,7 @@ def test_a_gradient_that_stays_not_finite_is_an_error_with_a_remedy():
 
 def test_polish_arrives_in_a_few_steps_and_leaves_the_unseen_alone():
     chain, field = toy()
-    theta = polish(chain, field, field.zero(), steps=8, stay=0.0, seed=0, log=Log(None))
+    theta, _ = polish(chain, field, field.zero(), steps=8, stay=0.0, seed=0, log=Log(None))
     assert float(field.parameters(theta)["youngs_modulus"]) == pytest.approx(
         0.4, rel=1e-3
     )  # noiseless; J is a difference
@@ -203,11 +206,24 @@ def test_linearised_gradient_is_the_one_of_the_backward_pass():
     torch.testing.assert_close(found, theta.grad, rtol=1e-4, atol=1e-10)  # forward differences
 
 
-def test_sensitivity_tells_the_seen_from_the_unseen():
+def test_what_is_shown_of_the_seen_and_the_unseen():
     chain, field = toy()
-    found = sensitivity(chain, field, field.zero(), seed=0)
-    assert found["youngs_modulus"][0] > 1 and 0 < found["youngs_modulus"][1] < 1
-    assert found["unseen"] == (0.0, float("inf"))
+    found = shown(chain, field, field.zero(), seed=0)
+    assert 255 * found.rms[0] > 1 and found.rms[1] == 0
+    assert found.evidence.JJ[0, 0] > 0 and found.evidence.JJ[1, 1] == 0
+    assert found.push.tolist() == [0.0, 0.0], "no force is known here"
+
+
+def test_a_known_force_is_told_from_a_known_motion(poked):
+    """The bar is poked by a force: it is drawn larger by what is learned as softer. Pushed by an acceleration it is
+    not, and nothing more is simulated."""
+    field, chain = poked
+    assert chain.pushed is not None
+    with torch.no_grad():
+        plain, harder = chain.simulate(field.zero()), chain.pushed(field.zero(), 0.1)
+    moved, more = (motion.position[-1] - motion.position[0] for motion in (plain, harder))
+    # small amplitudes: the motion is proportional to the force, to a hundredth
+    assert float((more - moved * math.exp(0.1)).norm()) < 0.02 * float(moved.norm())
 
 
 def test_drawn_frames_span_the_whole_clip():

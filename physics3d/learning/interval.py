@@ -1,0 +1,162 @@
+"""How far learned numbers can be trusted: what the clip says, what no clip can say, what was thought before it.
+
+    theta_hat - theta ~ N(0, V + d d^T + W)      V of the residuals (`sandwich.py`); d = A^-1 sum_i s_i is what the
+                                                 descent left undone, by the pull to the start among others
+    theta - start ~ N(0, S)                      before the clip: widths in the logarithm, on the diagonal
+    H = S^-1 + (V + d d^T + W)^-1,   theta - start ~ N(H^-1 (V + d d^T + W)^-1 (theta_hat - start), H^-1)
+
+W is what residuals do not show, for a wrong number there is made good by another theta that draws the same pictures: a
+sum of sigma^2 e e^T, with sigma a relative width (`Beyond`) and e the change of theta_hat that it brings. All stiffness
+(moduli, stresses at yield, viscosities) scales alike, 1_m; with phi = A^-1 J^T dz/d(ln force) for forces that are known
+in newtons (0 where what drives the motion is a known motion, an acceleration, or unknown)
+
+    surface, grid    e = 1_m
+    density          e = 1_m + phi: E goes with rho exactly, except for a known force. One that holds a thing bent says
+                     E whatever it weighs (phi = -1); one that makes it swing says both
+    length           e = 2 1_m + 4 phi: E goes with rho L^2; and velocities with L
+
+phi is exact where all that is stiff is learned. theta is ln of a number, of Poisson's ratio ln K/mu, or a velocity in
+its own unit (`fields.py`), so a 90 % interval of the number follows from that of theta.
+"""
+
+import math
+import re
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+import torch
+from annotated_types import Ge, Le
+from jaxtyping import Float
+
+from physics3d.checks import require_fields
+from physics3d.learning.fields import AXES, GlobalField, is_poissons_ratio, physical
+from physics3d.learning.sandwich import NORMAL, Evidence, spread
+from physics3d.log import Log
+from physics3d.world import Interval
+
+Width = Annotated[float, Ge(0), Le(10)]  # relative: a standard deviation in the logarithm
+STIFF = ("modulus", "stress", "viscosity", "consistency")  # how names of what scales with the stiffness end
+
+
+@dataclass(frozen=True, kw_only=True)
+class Beyond:
+    """Relative widths of what residuals do not show.
+
+    surface: of the stiffness of a reconstructed part, that is of the second moment of its section. The reconstructed
+    stem of `docs/results/filling.md`: 2 % wrong in the mean, 25 % in the worst section.
+    grid: of the stiffness, by the resolution of the solver. A cantilever two cells thick is 4.9 % wrong in frequency,
+    10 % in E (`docs/results/simulation.md`); the carnation, its stem as thick, 18 % in E against tetrahedra. Learning
+    takes more where the thinnest held section (`filling/section.py`) has fewer cells: 28 % for one.
+    """
+
+    surface: Width = 0.1
+    grid: Width = 0.15
+    density: Width = 0.1  # of the density, as given
+    length: Width = 0.05  # of the size, as given
+
+    def __post_init__(self):
+        require_fields(self, "learn.beyond")
+
+    def covariance(
+        self, stiff: Float[np.ndarray, " k"], speed: Float[np.ndarray, " k"], push: Float[np.ndarray, " k"]
+    ) -> Float[np.ndarray, "k k"]:
+        """W. `stiff`: 1_m; `speed`: theta of what is a velocity, its start included, else 0; `push`: phi."""
+        changes = (
+            (self.surface, stiff),
+            (self.grid, stiff),
+            (self.density, stiff + push),
+            (self.length, 2 * stiff + speed + 4 * push),
+        )
+        return sum((width**2 * np.outer(e, e) for width, e in changes), np.zeros((len(stiff),) * 2))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Posterior:
+    """theta - start after the clip, and before it."""
+
+    mean: Float[np.ndarray, " k"]
+    covariance: Float[np.ndarray, "k k"]
+    before: Float[np.ndarray, " k"]  # standard deviations
+
+
+def posterior(
+    theta: Float[np.ndarray, " k"],
+    evidence: Evidence,
+    *,
+    before: Float[np.ndarray, " k"],
+    beyond: Float[np.ndarray, "k k"],
+    log: Log,
+) -> Posterior:
+    """`theta`: found, from the middle of what was thought before; `before`: widths of that; `beyond`: W."""
+    found = spread(evidence)
+    log.info(
+        f"residuals hang together over {found.frames} frame(s) at a time; as good as {found.places:.1f} independent "
+        f"places and {found.times:.1f} independent times"
+    )
+    # in units of the prior; what the pictures do not show at all says nothing
+    A = before[:, None] * evidence.JJ * before
+    values, vectors = np.linalg.eigh(A)
+    shown = values > 1e-9 * max(values[-1], 1e-300)
+    values, U = values[shown], vectors[:, shown]
+    gain = U / values  # A^-1 U
+    V = gain.T @ (before[:, None] * found.B * before) @ gain
+    fat = U.T @ (found.student[:, None] * U)
+    undone = gain.T @ (before * evidence.score.sum((0, 1)))
+    V = fat @ V @ fat.T + np.outer(undone, undone) + U.T @ (beyond / before[:, None] / before) @ U
+    precision = U @ np.linalg.solve(V + 1e-12 * np.eye(len(V)), U.T)
+    covariance = np.linalg.inv(np.eye(len(before)) + precision)
+    mean = covariance @ precision @ (theta / before)
+    return Posterior(mean=before * mean, covariance=before[:, None] * covariance * before, before=before)
+
+
+def intervals(field: GlobalField, found: Posterior) -> dict[str, Interval]:
+    """Of every learned number, by its name."""
+    told: dict[str, Interval] = {}
+    rows = [(name, i) for i, group in enumerate(field.groups) for name in group]
+    rows += [(name, i) for i, name in enumerate(field.names) if name in AXES]
+    for name, i in rows:
+
+        def value(x: float, name=name, i=i) -> float:
+            theta = torch.from_numpy(found.mean.copy())
+            theta[i] = x
+            return physical(field, theta)[name]
+
+        centre, deviation = float(found.mean[i]), float(math.sqrt(found.covariance[i, i]))
+        unit = field.velocity_scale or 1.0 if name in AXES else 1.0
+        told[name] = Interval(
+            mean=_coordinate(name, value(centre)),
+            deviation=unit * deviation,
+            before=unit * float(found.before[i]),
+            low=value(centre - NORMAL * deviation),
+            high=value(centre + NORMAL * deviation),
+            determined=deviation <= 0.5 * float(found.before[i]),
+        )
+    return told
+
+
+def log_normal(*, middle: float, deviation: float, before: float) -> Interval:
+    """Of a positive number whose logarithm is normal around ln `middle`."""
+    low, high = (middle * math.exp(side * NORMAL * deviation) for side in (-1, 1))
+    determined = deviation <= 0.5 * before
+    return Interval(
+        mean=math.log(middle), deviation=deviation, before=before, low=low, high=high, determined=determined
+    )
+
+
+def _coordinate(name: str, value: float) -> float:
+    """What is normal: ln of a number, of Poisson's ratio ln K/mu, a velocity itself."""
+    if name in AXES:
+        return value
+    return math.log(2 * (1 + value) / (3 * (1 - 2 * value)) if is_poissons_ratio(name) else value)
+
+
+def is_stiff(name: str) -> bool:
+    """Whether a parameter scales with the stiffness: it has the unit of a stress, or of a stress times a time."""
+    return re.sub(r"_[23]$", "", name.split("+")[0]).endswith(STIFF)
+
+
+def words(found: Interval) -> str:
+    """An interval for a person."""
+    between = f"between {found.low:.4g} and {found.high:.4g}"
+    return f"{between} (90 %)" if found.determined else f"not determined by this clip; {between}"

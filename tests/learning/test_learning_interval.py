@@ -1,0 +1,220 @@
+"""Intervals hold the truth as often as they say: many draws of noise that hangs together in space and time, whose truth
+and whose closed forms are written here."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy import ndimage
+
+from physics3d.learning.fields import GlobalField
+from physics3d.learning.interval import NORMAL, Beyond, intervals, is_stiff, posterior, words
+from physics3d.learning.linear import shown
+from physics3d.learning.loss import Chain
+from physics3d.learning.polish import polish
+from physics3d.learning.sandwich import Evidence, block_length, blocks, correlation_length, spread
+from physics3d.log import Log
+from physics3d.priors.exemplar import Exemplar
+
+NAMES = ("youngs_modulus", "relaxation_time", "bulk_modulus")
+
+
+def noise(rng, frames: int, h: int, w: int, *, memory: float, blur: float) -> np.ndarray:
+    """Of unit variance; AR(1) in time, a Gaussian filter of `blur` px in space."""
+    fresh = ndimage.gaussian_filter(rng.standard_normal((frames, h, w)), (0, blur, blur), mode="wrap")
+    fresh /= fresh.std()
+    out = fresh.copy()
+    for i in range(1, frames):
+        out[i] = memory * out[i - 1] + math.sqrt(1 - memory**2) * fresh[i]
+    return out
+
+
+def evidence_of(J: np.ndarray, r: np.ndarray) -> Evidence:
+    """Of derivatives [t, h, w, k] and residuals [t, h, w]."""
+    t, h, w, k = J.shape
+    row, column = np.divmod(np.arange(h * w), w)
+    block, count = blocks(row, column, correlation_length(r))
+
+    def summed(values):
+        out = np.zeros((t, count, k))
+        np.add.at(out, (slice(None), block), values.reshape(t, h * w, k))
+        return out
+
+    flat = J.reshape(-1, k)
+    return Evidence(JJ=flat.T @ flat, score=summed(J * r[..., None]), share=summed(J**2))
+
+
+@pytest.mark.parametrize("memory, blur", [(0.0, 0.0), (0.8, 1.0), (0.9, 1.5)])
+def test_linear_least_squares_is_covered_however_residuals_hang_together(memory, blur):
+    """Three coefficients of moving patterns, 200 draws. 80 to 97 %: the sampling error of 600 hits is 1.2 %, and few
+    blocks leave the spread itself uncertain. Residuals taken as independent hold the truth in less than half."""
+    rng = np.random.default_rng(1)
+    frames, h, w = 20, 24, 32
+    t, (y, x) = np.arange(frames) / frames, np.mgrid[:h, :w]
+    blob = np.exp(-((x - w / 2) ** 2 + (y - h / 2) ** 2) / 72)
+    courses = (np.exp(-2 * t) * np.sin(9 * t), t * np.exp(-2 * t) * np.cos(9 * t), np.exp(-t) * np.sin(20 * t + 1))
+    patterns = (np.gradient(blob, axis=1), np.gradient(blob, axis=1), blob * np.sin(x / 3))
+    J = np.stack([q[:, None, None] * g for q, g in zip(courses, patterns, strict=True)], -1)
+    flat = J.reshape(-1, 3)
+    inverse = np.linalg.inv(flat.T @ flat)
+    hits, naive = 0, 0
+    for _ in range(200):
+        e = noise(rng, frames, h, w, memory=memory, blur=blur)
+        wrong = inverse @ flat.T @ e.ravel()  # of the estimate
+        r = e - J @ wrong
+        found = spread(evidence_of(J, r))
+        deviation = np.sqrt((inverse @ found.B @ inverse).diagonal()) * found.student
+        hits += int((np.abs(wrong) < NORMAL * deviation).sum())
+        naive += int((np.abs(wrong) < NORMAL * np.sqrt(inverse.diagonal() * (r**2).mean())).sum())
+    assert 0.80 <= hits / 600 <= 0.97
+    assert naive / 600 > 0.85 if memory == 0 else naive / 600 < 0.5
+
+
+def oscillator(size=(8, 12), frames=18) -> tuple[Chain, GlobalField, torch.Tensor]:
+    """One mode of a Kelvin-Voigt solid whose picture is a blob that grows and shrinks with it,
+
+        q(t) = e^(-t/tau) cos(w t),   w^2 = k - 1/tau^2
+
+    and the clip at k = 9, tau = 2. The third parameter is in no picture."""
+    t = torch.arange(frames, dtype=torch.float64) / 6
+    y, x = torch.meshgrid(*(torch.linspace(-1, 1, n, dtype=torch.float64) for n in size), indexing="ij")
+    blob = torch.exp(-3 * (x**2 + y**2))
+    field = GlobalField(
+        start={n: torch.tensor(v) for n, v in zip(NAMES, (8.0, 2.5, 2.0))},
+        learn=NAMES,
+    )
+
+    def course(k, tau):
+        return torch.exp(-t / tau) * torch.cos(torch.sqrt(k - tau**-2) * t)
+
+    def render(motion, view, frames):
+        return (0.5 + 0.3 * motion[frames][:, None, None] * blob)[..., None].expand(-1, *size, 3)
+
+    def simulate(theta):
+        values = field.parameters(theta)
+        return course(values["youngs_modulus"], values["relaxation_time"])
+
+    truth = render(course(torch.tensor(9.0).double(), torch.tensor(2.0).double()), 0, torch.arange(frames))
+    return Chain(simulate=simulate, render=render, clips={0: truth}, prior=Exemplar(blur=(0.0,))), field, truth
+
+
+def test_a_viscoelastic_oscillator_is_recovered_with_its_intervals():
+    """Stiffness and relaxation time of a closed form, 200 noisy clips, each fitted by the polish of the pipeline from a
+    start that is 11 % and 25 % off; the same limits as above. What no picture shows keeps the width it had."""
+    rng = np.random.default_rng(2)
+    chain, field, truth = oscillator()
+    hits, naive, errors = np.zeros(2), np.zeros(2), []
+    for _ in range(200):
+        e = 0.03 * noise(rng, *truth.shape[:3], memory=0.8, blur=1.0)
+        clip = truth + torch.from_numpy(e)[..., None]
+        noisy = Chain(simulate=chain.simulate, render=chain.render, clips={0: clip}, prior=chain.prior)
+        theta, _ = polish(noisy, field, field.zero(), steps=3, stay=0.0, seed=0, log=Log(None))
+        seen = shown(noisy, field, theta, seed=0)
+        none = np.zeros((3, 3))
+        after = posterior(theta.numpy(), seen.evidence, before=np.full(3, 2.3), beyond=none, log=Log(None))
+        told = intervals(field, after)
+        for i, (name, true) in enumerate({"youngs_modulus": 9.0, "relaxation_time": 2.0}.items()):
+            hits[i] += told[name].low < true < told[name].high
+            assert told[name].determined
+            found = float(field.parameters(theta)[name])
+            errors.append(math.log(found / true))
+            s = math.sqrt(np.linalg.inv(seen.evidence.JJ[:2, :2])[i, i] * float((e**2).mean()))
+            naive[i] += abs(math.log(found / true)) < NORMAL * s
+        unseen = told["bulk_modulus"]
+        assert not unseen.determined and unseen.deviation == pytest.approx(2.3, rel=1e-3)
+        assert words(unseen).startswith("not determined by this clip; between ")
+        assert unseen.low == pytest.approx(2 * math.exp(-2.3 * NORMAL), rel=1e-2)
+    assert 0.80 <= hits.sum() / 400 <= 0.97
+    assert naive.sum() / 400 < 0.5
+    assert abs(np.mean(errors)) < 0.2 * np.std(errors), "no bias to speak of beside the spread"
+
+
+def test_a_wrong_density_moves_the_stiffness_as_is_said():
+    """An oscillator k, m: q = sqrt(k/m) swings freely by cos(w t), so k goes with m; held bent by a force, q = F/k,
+    whatever m; let go under a force, q = F/k (1 - cos w t), in between. Fitted with a mass that is 4 % too large
+    against 1 + phi: to a tenth of that, both being differences of first order."""
+    t = torch.arange(24, dtype=torch.float64) / 8
+    field = GlobalField(start={"youngs_modulus": torch.tensor(9.0)}, learn=("youngs_modulus",))
+    wrong = math.log(1.04)
+    laws = {
+        "free": lambda k, m, F: torch.cos(torch.sqrt(k / m) * t),
+        "bent": lambda k, m, F: F / k * torch.ones_like(t),
+        "pushed": lambda k, m, F: F / k * (1 - torch.cos(torch.sqrt(k / m) * t)),
+    }
+    shift = {}
+    for name, law in laws.items():
+        draw = lambda q, view, frames: (0.5 + 0.3 * q[frames])[:, None, None, None].expand(-1, 4, 4, 3)
+        k = lambda theta: field.parameters(theta)["youngs_modulus"]
+        of = lambda m, law=law, draw=draw, k=k: Chain(
+            simulate=lambda theta: law(k(theta), m, 2.0),
+            render=draw,
+            clips={0: draw(law(torch.tensor(9.0).double(), 1.0, 2.0), 0, torch.arange(24))},
+            prior=Exemplar(blur=(0.0,)),
+            pushed=lambda theta, more: law(k(theta), m, 2.0 * math.exp(more)),
+        )
+        found, _ = polish(of(math.exp(wrong)), field, field.zero(), steps=8, stay=0.0, seed=0, log=Log(None))
+        seen = shown(of(1.0), field, field.zero(), seed=0, step=1e-3)
+        shift[name] = 1 + float(seen.push[0])
+        assert float(found[0]) / wrong == pytest.approx(shift[name], abs=0.1)
+        W = Beyond(surface=0.0, grid=0.0, density=0.1, length=0.0).covariance(np.ones(1), np.zeros(1), seen.push)
+        assert math.sqrt(W[0, 0]) == pytest.approx(0.1 * abs(shift[name]))
+    assert shift["free"] == pytest.approx(1, abs=1e-2) and shift["bent"] == pytest.approx(0, abs=1e-2)
+    assert 0.1 < shift["pushed"] < 0.9
+
+
+def test_what_the_clip_does_not_show_widens_the_interval():
+    """A tenth in density and a twentieth in length: sqrt(0.1^2 + (2 0.05)^2) of the stiffness, nothing of a time."""
+    J = np.random.default_rng(0).standard_normal((20, 8, 8, 2))
+    exact = evidence_of(J, np.zeros((20, 8, 8)))
+    W = Beyond(surface=0.0, grid=0.0).covariance(np.array([1.0, 0.0]), np.zeros(2), np.zeros(2))
+    after = posterior(np.zeros(2), exact, before=np.full(2, 100.0), beyond=W, log=Log(None))
+    assert np.sqrt(after.covariance.diagonal()) == pytest.approx([math.sqrt(0.02), 0.0], abs=1e-4)
+
+
+def test_what_a_descent_left_undone_widens_the_interval():
+    """Stopped a tenth away from the best fit of an exact clip, the truth is within a deviation."""
+    chain, field, _ = oscillator()
+    best, _ = polish(chain, field, field.zero(), steps=12, stay=0.0, seed=0, log=Log(None))
+    stopped = best + torch.tensor([0.05, -0.1, 0.0], dtype=torch.float64)
+    seen = shown(chain, field, stopped, seed=0)
+    none = np.zeros((3, 3))
+    after = posterior(stopped.numpy(), seen.evidence, before=np.full(3, 2.3), beyond=none, log=Log(None))
+    deviation = np.sqrt(after.covariance.diagonal())
+    # the step back is that of a linearised chain, right to a third here; what is left of the pictures adds to it
+    assert (deviation[:2] > 0.65 * np.array([0.05, 0.1])).all() and (deviation[:2] < 0.4).all()
+
+
+def test_lengths_of_correlation_are_those_of_the_noise(rng):
+    """White noise: the least. A Gaussian filter of s has the correlation exp(-d^2/(4 s^2)), 1/e at 2 s."""
+    assert correlation_length(noise(rng, 20, 40, 60, memory=0.0, blur=0.0)) == 1.0
+    assert correlation_length(noise(rng, 20, 60, 80, memory=0.5, blur=2.0)) == pytest.approx(4.0, rel=0.15)
+    steady = noise(rng, 400, 1, 1, memory=0.9, blur=0.0)[:, 0]
+    assert block_length(rng.standard_normal((400, 1))) <= 2 < block_length(steady)
+
+
+@pytest.mark.parametrize("views", [1, 3])
+def test_every_view_counts(views):
+    """The same pictures seen three times, with noise of their own, say sqrt(3) as much."""
+    rng = np.random.default_rng(3)
+    chain, field, truth = oscillator()
+    clips = {v: truth + torch.from_numpy(0.03 * rng.standard_normal(truth.shape)) for v in range(views)}
+    many = Chain(simulate=chain.simulate, render=chain.render, clips=clips, prior=chain.prior)
+    theta = torch.tensor([math.log(9 / 8), math.log(2 / 2.5), 0.0], dtype=torch.float64)
+    found = shown(many, field, theta, seed=0).evidence
+    one = shown(chain, field, theta, seed=0).evidence
+    np.testing.assert_allclose(found.JJ, views * one.JJ, rtol=1e-6)
+    assert found.score.shape[1] == views * one.score.shape[1] or views == 1
+
+
+def test_units_of_a_stress_are_known_by_their_name():
+    stiff = ("youngs_modulus", "plant.youngs_modulus", "branch_shear_modulus_2", "yield_stress", "viscosity")
+    assert all(is_stiff(name) for name in (*stiff, "branch_shear_modulus+branch_bulk_modulus"))
+    assert not any(
+        is_stiff(name) for name in ("poissons_ratio", "shear_relaxation_time", "velocity_x", "friction_angle")
+    )
+
+
+def test_an_impossible_width_is_refused():
+    with pytest.raises(ValueError, match=r"learn\.beyond\.grid is -1"):
+        Beyond(grid=-1.0)
