@@ -7,16 +7,18 @@ ARGS ?=
 REAL ?=
 PRED ?=
 OUT ?=
+MATERIAL ?=
+UNSEEN ?=
 PORT ?= 5000
 PYTHON ?= python3
 # these may hold anything, quotes, semicolons and dollar signs too: they are taken as they stand, and reach commands by the
 # environment, never as a part of a line that a shell or make reads
-$(foreach name,SCENE PROFILE METHOD DATA ARGS PORT PYTHON REAL PRED OUT,$(eval override $(name) := $$(value $(name))))
-export SCENE PROFILE METHOD DATA ARGS PORT PYTHON REAL PRED OUT
+$(foreach name,SCENE PROFILE METHOD DATA ARGS PORT PYTHON REAL PRED OUT MATERIAL UNSEEN,$(eval override $(name) := $$(value $(name))))
+export SCENE PROFILE METHOD DATA ARGS PORT PYTHON REAL PRED OUT MATERIAL UNSEEN
 
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup run score twin ui view test newest bench lint architecture clean
+.PHONY: help setup run score twin fit-curves ui view test newest bench lint architecture clean
 py := .venv/bin/python
 # torch's own threads spin beside those of the renderer and the simulator: OMP_NUM_THREADS=1 unless you say otherwise
 threads := OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1}
@@ -53,6 +55,9 @@ score: $(ready) ## any two videos compared: REAL=<clip> PRED=<clip> [OUT=<folder
 
 twin: $(ready) ## a thing with known material as photographs and clips on disk: OUT=<new folder>
 	@$(threads) $(py) -m pipeline.twin
+
+fit-curves: $(ready) ## a material from tables of a test machine: DATA=<folder of csv> MATERIAL=<name> [UNSEEN=<test>] [OUT=<folder>]
+	@$(threads) $(py) -m pipeline.fit_curves
 
 ui: $(ready) ## MLflow: prints the address of the page that compares runs, and serves it
 	@$(py) -m pipeline.tracking .

@@ -81,8 +81,11 @@ def fit(material: AbstractMaterial, field: GlobalField, tests: list[LabTest], *,
         key = theta.tobytes()
         if key not in cache:
             cache.clear()
-            r, J = residuals(tests, predict(material, field, theta, tests))
-            cache[key] = np.concatenate(r), np.concatenate(J)
+            if allowed(material, field, theta):
+                r, J = (np.concatenate(x) for x in residuals(tests, predict(material, field, theta, tests)))
+            else:
+                r, J = np.full(rows, LOST), np.zeros((rows, count))
+            cache[key] = r, J
         return cache[key]
 
     def descend(theta: np.ndarray, evaluations: int) -> tuple[np.ndarray, float]:
@@ -93,8 +96,7 @@ def fit(material: AbstractMaterial, field: GlobalField, tests: list[LabTest], *,
 
     looked = []
     for theta in starts(material, field, tests, bounds):
-        first = predict(material, field, theta, tests)
-        if any(p.lost for p in first):
+        if not allowed(material, field, theta) or any(p.lost for p in predict(material, field, theta, tests)):
             continue
         looked.append(descend(theta, LOOK))
         log.info(f"start {len(looked)}: error {100 * np.sqrt(looked[-1][1] / len(tests)):.3g} %")
@@ -108,6 +110,15 @@ def fit(material: AbstractMaterial, field: GlobalField, tests: list[LabTest], *,
         if as_good(best, rival, len(tests)) and all(apart(known, rival) for known in (best, *others)):
             others.append(rival)
     return Fits(best=best, others=tuple(others))
+
+
+def allowed(material: AbstractMaterial, field: GlobalField, theta: np.ndarray) -> bool:
+    """Whether the parameters obey what the material asks of all of them together, as Yeoh's do."""
+    try:
+        material.check_parameters(field.parameters(torch.from_numpy(theta)))
+    except ValueError:
+        return False
+    return True
 
 
 def residuals(tests: list[LabTest], predictions: list[Prediction]) -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -170,6 +181,8 @@ def starts(material: AbstractMaterial, field: GlobalField, tests: list[LabTest],
         for i in moduli:
             theta[i] = np.log(stiffness(tests) / float(field.start[field.groups[i][0]])) - np.log(len(moduli))
         for _ in range(2 if moduli else 0):  # once more where the law is not linear
+            if not allowed(material, field, theta):
+                break
             predictions = predict(material, field, theta, tests)
             factors = [_softer(t, p) for t, p in zip(tests, predictions) if not p.lost]
             theta[moduli] += np.log(np.median(factors)) if factors else np.log(10)
