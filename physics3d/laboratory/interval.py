@@ -49,8 +49,8 @@ def correlation(residual: Float[np.ndarray, " n"]) -> float:
 
 def interval(
     theta: Float[np.ndarray, " p"],
-    residuals: list[Float[np.ndarray, " n"]],
-    slopes: list[Float[np.ndarray, "n p"]],
+    residuals: list[Float[np.ndarray, " _"]],
+    slopes: list[Float[np.ndarray, "_ p"]],
     bounds: tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]],
 ) -> Interval:
     """Of a fit theta within its bounds. `residuals` and `slopes` are of the tests; rows that tell nothing are left out."""
