@@ -7,7 +7,8 @@ parameters are theta of `learning/fields.py` (logarithms); derivatives are exact
 trust region within bounds (SciPy; Branch, Coleman and Li 1999).
 
 Relaxation times start spread over the times that the tables span, in five ways, all moduli at the stiffness that the
-curves show. Minima other than the best that explain the tests as well are told: two valleys.
+curves show. Minima other than the best that explain the tests as well are told: two valleys. Where a parameter is not
+determined, every interval is walked out to where the tests object (`profile.py`).
 
 Bounds: moduli 1e-4 to 1e4 times the stiffness of the curves; relaxation times from a tenth of the shortest step to a hundred
 times the longest test, beyond which nothing would tell them; K/mu of Poisson's ratio from 2/3 to 5000, nu 0 to 0.4999.
@@ -21,8 +22,9 @@ import torch
 from jaxtyping import Float
 from scipy import optimize, stats
 
-from physics3d.laboratory.interval import Interval, interval
+from physics3d.laboratory.interval import LEVEL, Interval, interval, widened
 from physics3d.laboratory.prediction import Prediction, predict
+from physics3d.laboratory.profile import ends
 from physics3d.laboratory.tables import LabTest
 from physics3d.learning.fields import GlobalField, is_poissons_ratio
 from physics3d.log import Log
@@ -36,6 +38,7 @@ STARTS = {  # places of the relaxation times between the shortest step (0) and t
 }
 LOST = 10.0  # residual, in the scale of its test, of a row that no deformation could meet
 LOOK, POLISH = 12, 100  # evaluations of a start, and of one that is among the best
+MOST = 0.25  # of the sum of squares, that another answer may have beyond the best
 RIVAL = 4.0  # times the least sum of squares: what a start may have after its first look
 
 
@@ -106,8 +109,11 @@ def fit(material: AbstractMaterial, field: GlobalField, tests: list[LabTest], *,
     polished = sorted((descend(x, POLISH) for x, cost in looked if cost <= RIVAL * least), key=lambda pair: pair[1])
     valleys = [_fit(material, field, x, cost, tests, bounds) for x, cost in polished]
     best, others = valleys[0], []
+    if best.undetermined:
+        walked = ends(best.theta, bounds, lambda x: both(x)[0], lambda x: both(x)[1], as_good(best, 1))
+        best = _named(field, best.theta, best.cost, widened(best.interval, *walked, bounds))
     for rival in valleys[1:]:
-        if as_good(best, rival, len(tests)) and all(apart(known, rival) for known in (best, *others)):
+        if rival.cost <= as_good(best, count) and all(apart(known, rival) for known in (best, *others)):
             others.append(rival)
     return Fits(best=best, others=tuple(others))
 
@@ -208,7 +214,11 @@ def _fit(material, field: GlobalField, theta: np.ndarray, cost: float, tests: li
     r, J = residuals(tests, predict(material, field, theta, tests))
     # rows before anything happens agree whatever the material is, and would make the noise too small
     told = [np.any(j != 0, 1) for j in J]
-    found = interval(theta, [a[k] for a, k in zip(r, told) if k.any()], [j[k] for j, k in zip(J, told) if k.any()], bounds)
+    seen = [(a[k], j[k]) for a, j, k in zip(r, J, told) if k.any()]
+    return _named(field, theta, cost, interval(theta, [a for a, _ in seen], [j for _, j in seen], bounds))
+
+
+def _named(field: GlobalField, theta: np.ndarray, cost: float, found: Interval) -> Fit:
     ends = [_values(field, x) for x in (found.lower, found.upper)]
     intervals = {name: (ends[0][name], ends[1][name]) for group in field.groups for name in group}
     undetermined = tuple(n for group, told in zip(field.groups, found.determined) if not told for n in group)
@@ -220,19 +230,24 @@ def _values(field: GlobalField, theta: np.ndarray) -> dict[str, float]:
     return {name: float(value) for name, value in field.parameters(torch.from_numpy(theta)).items()}
 
 
-def as_good(best: Fit, rival: Fit, tests: int) -> bool:
-    """Whether the tests, worth as many independent rows as they are, cannot tell the rival from the best (F test, 90 %; at
-    most by a quarter of the sum of squares)."""
-    p = len(best.theta)
-    left = max(best.interval.worth - p, 1.0)
-    return rival.cost <= best.cost * (1 + min(p / left * float(stats.f.ppf(0.9, p, left)), 0.25)) + 1e-20 * tests
+def as_good(best: Fit, parameters: int) -> float:
+    """The largest sum of squares that the tests, worth as many independent rows as they are, cannot tell from the best, so
+    many parameters being free (F test, 90 %). At most a quarter more: where a law cannot follow a curve, its residuals are
+    hardly worth a row, and any other would do."""
+    left = freedom(best)
+    return best.cost * (1 + min(parameters / left * float(stats.f.ppf(LEVEL, parameters, left)), MOST)) + 1e-20
+
+
+def freedom(fit: Fit) -> float:
+    """Independent rows that are left when the parameters are paid for."""
+    return max(fit.interval.worth - len(fit.theta), 1.0)
 
 
 def apart(one: Fit, other: Fit) -> bool:
     """Whether two fits are two answers: not the same with its branches in another order, nor two points of one flat valley."""
 
-    def ordered(fit: Fit) -> list[tuple[float, float]]:
-        """(log of value, half its interval), branches in the order of their relaxation times."""
+    def ordered(fit: Fit) -> list[list[float]]:
+        """Logarithms of the ends, branches in the order of their relaxation times."""
         branches = [
             [n for n in fit.intervals if _suffix(n) == s and ("branch" in n or _is_time(n))] for s in ("", "_2", "_3")
         ]
@@ -241,10 +256,10 @@ def apart(one: Fit, other: Fit) -> bool:
         names = own + list(itertools.chain(*sorted((b for b in branches if b), key=key)))
         found = []
         for n in names:
-            low, high = fit.intervals[n]
-            size = (lambda v: 0.5 - v) if is_poissons_ratio(n) else (lambda v: v)
-            found.append((np.log(size(fit.values[n])), abs(np.log(size(high) / size(low))) / 2))
+            # Poisson's ratio by what is missing to 1/2
+            found.append(sorted(np.log(0.5 - v if is_poissons_ratio(n) else v) for v in fit.intervals[n]))
         return found
 
+    margin = np.log(1.2)
     pairs = zip(ordered(one), ordered(other))
-    return any(abs(a - b) > np.log(1.2) + half_a + half_b for (a, half_a), (b, half_b) in pairs)
+    return any(low_b > high_a + margin or high_b < low_a - margin for (low_a, high_a), (low_b, high_b) in pairs)

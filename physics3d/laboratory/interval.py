@@ -15,7 +15,7 @@ interval never reaches beyond.
 Rows of the prescribed column are taken as exact. White (1980); Newey and West (1987); Andrews (1991) for AR(1) plug-in.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -76,6 +76,16 @@ def interval(
     covariance = np.linalg.inv(information + np.diag(allowed**-2))
     half = stats.t.ppf((1 + LEVEL) / 2, max(freedom, 1.0)) * np.sqrt(np.diag(covariance))
     low, high = np.maximum(theta - half, lower), np.minimum(theta + half, upper)
-    # a factor of ten between its ends, or half of what was allowed, is no answer
-    determined = tuple(bool(x) for x in (high - low < np.minimum(np.log(10), (upper - lower) / 2)))
-    return Interval(lower=low, upper=high, determined=determined, correlation=tuple(rho), worth=worth)
+    return Interval(lower=low, upper=high, determined=told(low, high, bounds), correlation=tuple(rho), worth=worth)
+
+
+def widened(of: Interval, lower: np.ndarray, upper: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]) -> Interval:
+    """The interval that reaches to both."""
+    low, high = np.minimum(of.lower, lower), np.maximum(of.upper, upper)
+    return replace(of, lower=low, upper=high, determined=told(low, high, bounds))
+
+
+def told(low: np.ndarray, high: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]) -> tuple[bool, ...]:
+    """Whether the tests determine a parameter: a factor of ten between its ends, or half of what was allowed, is no
+    answer."""
+    return tuple(bool(x) for x in (high - low < np.minimum(np.log(10), (bounds[1] - bounds[0]) / 2)))

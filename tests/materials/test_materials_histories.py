@@ -1,7 +1,6 @@
 """Whole histories in one launch against the plain twin, closed forms and finite differences."""
 
 import cProfile
-import dataclasses
 import pstats
 
 import pytest
@@ -102,15 +101,13 @@ def test_short_tests_beside_long_ones_are_those_alone():
 
 
 def test_a_load_that_cannot_be_borne_is_said():
-    """A Hencky spring in tension bears ln(a)/a of its modulus, 1/e at most; and no other test suffers from it."""
-    fluid = dataclasses.replace(VISCO, elastic=False)
-    _, c = coefficients(fluid, 2)
-    most = 9 * c[1, 0] * c[0, 0] / (3 * c[1, 0] + c[0, 0])
-    given = torch.stack([torch.linspace(0, 1, 8).double() * most, torch.linspace(0, 0.01, 8).double() * most], 1)
-    done = histories.histories(fluid, c, schedule([NOMINAL, NOMINAL], given))
+    """What would stretch it by more than a factor of eleven in one row is no test; the one beside it does not suffer."""
+    _, c = coefficients(VISCO, 2)
+    given = torch.linspace(0, -1, 8).double()[:, None] * torch.tensor([-1e9, 1e2])
+    done = histories.histories(VISCO, c, schedule([NOMINAL, NOMINAL], given))
     assert done.lost.tolist() == [True, False]
-    assert torch.isfinite(done.stretch[:, 1]).all()
-    torch.testing.assert_close(done.nominal[:, 1], given[:, 1], rtol=0, atol=1e-9 * most.item())
+    assert torch.isfinite(done.stretch).all()
+    torch.testing.assert_close(done.nominal[:, 1], given[:, 1], rtol=0, atol=1e-6)  # 1e-12 of the stiffness
 
 
 def test_cost_grows_with_the_rows_alone(monkeypatch):
