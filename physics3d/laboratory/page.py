@@ -68,10 +68,14 @@ def write(material: str, config: dict[str, Any], fits: Fits, rows: list[Row], *,
                 table.writerow((i + 1, name, unit(name), *(f"{x:.6g}" for x in number), told))
     with log.path("errors.csv").open("w", newline="") as stream:
         table = csv.writer(stream)
-        table.writerow(("test", "role", "controlled", "rows", "error_percent", "largest_percent", "error_at_start_percent"))
+        table.writerow(
+            ("test", "role", "controlled", "rows", "error_percent", "largest_percent", "error_at_start_percent")
+        )
         for r in rows:
             numbers = (f"{100 * x:.4g}" for x in (r.error, r.largest, r.at_start))
-            table.writerow((r.test.name, "fitted" if r.fitted else "unseen", r.test.control, len(r.test.time), *numbers))
+            table.writerow(
+                (r.test.name, "fitted" if r.fitted else "unseen", r.test.control, len(r.test.time), *numbers)
+            )
     log.path("material.yaml").write_text(as_yaml(material, config, best, seen))
     log.path(done).write_text(as_page(material, fits, rows))
     return log.path(done)
@@ -110,8 +114,13 @@ def as_page(material: str, fits: Fits, rows: list[Row]) -> str:
         role = "fitted" if r.fitted else "**unseen**"
         q = "" if r.correlation is None else f"{r.correlation:.2f}"
         lines.append(f"| {r.test.name} | {role} | {r.test.control} | {len(r.test.time)} | {numbers} | {q} |")
-    lines += ["", "Errors are root mean squares of the residual over that of what was measured (stress; stretch - 1 or shear"]
-    lines += ["where stress was controlled). Correlation is that of the residual from one row to the next: near 1 the material"]
+    lines += [
+        "",
+        "Errors are root mean squares of the residual over that of what was measured (stress; stretch - 1 or shear",
+    ]
+    lines += [
+        "where stress was controlled). Correlation is that of the residual from one row to the next: near 1 the material"
+    ]
     lines += ["cannot follow the curve, near 0 what is left is noise.", ""]
     if not any(not r.fitted for r in rows):
         lines += ["No test was held out (UNSEEN=<name>): these errors say how well curves are drawn, not foretold.", ""]
@@ -138,7 +147,9 @@ def curves(rows: list[Row]) -> Any:
     for axis, r in zip(axes.flat, rows):
         time, test = _from_the_start(r.test.time), r.test
         axis.plot(time, test.measured, ".", color="0.5", markersize=3, label="measured")
-        axis.plot(time, r.prediction.measured, color="C0" if r.fitted else "C3", label="fitted" if r.fitted else "unseen")
+        axis.plot(
+            time, r.prediction.measured, color="C0" if r.fitted else "C3", label="fitted" if r.fitted else "unseen"
+        )
         strain = "shear" if test.kind == "shear" else "stretch - 1"
         axis.set(xlabel="time [s]", ylabel=f"{test.kind} stress [Pa]" if test.control == "deformation" else strain)
         axis.set_title(f"{test.name}: {100 * r.error:.3g} %", fontsize=10)

@@ -109,7 +109,9 @@ def _columns(name: str, cells: list[str]) -> list[tuple[str, str]]:
             raise ValueError(f"{name}: there is a column {cell.strip()!r}; take {', '.join(UNITS)}, each with its unit")
         if not bracket or unit not in UNITS[quantity]:
             allowed = ", ".join(f"[{u}]" for u in UNITS[quantity])
-            raise ValueError(f"{name}: the unit of {quantity} is {f'[{unit}]' if bracket else 'missing'}; take {allowed}")
+            raise ValueError(
+                f"{name}: the unit of {quantity} is {f'[{unit}]' if bracket else 'missing'}; take {allowed}"
+            )
         columns.append((quantity, unit))
     names = [quantity for quantity, _ in columns]
     for what, allowed in (("time", ("time",)), ("deformation", DEFORMATIONS), ("stress", STRESSES)):
@@ -150,9 +152,7 @@ def _checked(path: Path, found: dict[str, np.ndarray], words: dict[str, str], li
     if not shear and len(flat):
         row, at = lines[flat[0]], deformation[flat[0]]
         raise ValueError(f"{name}, line {row}: the stretch is {at:g}; it is length over length at rest, above 0")
-    kind: Literal["nominal", "true", "shear"] = (
-        "shear" if shear else "nominal" if "nominal stress" in found else "true"
-    )
+    kind: Literal["nominal", "true", "shear"] = "shear" if shear else "nominal" if "nominal stress" in found else "true"
     control: Literal["deformation", "stress"] = "stress" if words.get("control") == "stress" else "deformation"
     stress = found[next(n for n in STRESSES if n in found)]
     test = LabTest(

@@ -53,7 +53,9 @@ class Histories:
     side: Float[Tensor, "t s"]  # b
     shear: Float[Tensor, "t s"]  # g
     tau: Float[Tensor, "t s 3 3"]  # Kirchhoff stress [Pa]
-    lost: Bool[Tensor, " s"]  # no deformation was found that meets the conditions; from there on the rest is not computed
+    lost: Bool[
+        Tensor, " s"
+    ]  # no deformation was found that meets the conditions; from there on the rest is not computed
     increment: Float[Tensor, "t s 3 3"]  # M of the step that ends at a row
     H: Float[Tensor, "t s 3 3"]  # F - I
     memory: Float[Tensor, "t m s"]

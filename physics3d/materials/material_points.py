@@ -87,7 +87,9 @@ class _Outputs:
 
 class _Advance(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, material: AbstractMaterial, dt: float | Tensor, L: Tensor, H: Tensor, coefficients: Tensor, memory: Tensor):
+    def forward(
+        ctx, material: AbstractMaterial, dt: float | Tensor, L: Tensor, H: Tensor, coefficients: Tensor, memory: Tensor
+    ):
         start_warp()
         n, real = len(H), _REAL[H.dtype]
         L, H, columns, memory = (t.detach().contiguous() for t in (L, H, coefficients.expand(-1, n), memory))
@@ -124,7 +126,10 @@ class _Advance(torch.autograd.Function):
         wp.launch(
             ctx.kernel,
             len(H),
-            inputs=[wp.from_torch(steps, dtype=real), *_Inputs(L=L, H=H, coefficients=columns, memory=memory).arrays(real)],
+            inputs=[
+                wp.from_torch(steps, dtype=real),
+                *_Inputs(L=L, H=H, coefficients=columns, memory=memory).arrays(real),
+            ],
             outputs=_Outputs(H_next=H_next, tau=tau, memory_next=memory_next).arrays(real),
             adj_inputs=[None, *adjoint.arrays(real)],
             adj_outputs=given.arrays(real),
