@@ -1,9 +1,9 @@
 """A material from tables of a test machine: make fit-curves DATA=folder MATERIAL=name [UNSEEN=test,test] [OUT=folder].
 
-Every csv in DATA is a test (docs/laboratory.md); MATERIAL is one of conf/material and says which model, which parameters
-are fitted (learn, ties) and what the others are (start). Tests that UNSEEN names are predicted only. material.yaml, fit.md,
-tables and a picture in OUT, or in a folder beside DATA. Exit codes: 0 done, 1 the tables cannot be fitted, 2 DATA or
-MATERIAL is not given, 130 Ctrl-C.
+Every csv in DATA is a test (docs/laboratory.md); MATERIAL is one of conf/material and says which model, which
+parameters are fitted (learn, ties) and what the others are (start). Tests that UNSEEN names are predicted only.
+material.yaml, fit.md, tables and a picture in OUT, or in a folder beside DATA. Exit codes: 0 done, 1 the tables cannot
+be fitted, 2 DATA or MATERIAL is not given, 130 Ctrl-C.
 """
 
 import os
@@ -81,7 +81,8 @@ def fit_curves(folder: Path, name: str, unseen: tuple[str, ...], out: Path) -> N
 
 
 def configured(name: str) -> tuple[Any, Any, dict[str, Any]]:
-    """(material, its GlobalField, what conf/material says) of one of conf/material. Raises ValueError for another name."""
+    """(material, its GlobalField, what conf/material says) of one of conf/material. Raises ValueError for another
+    name."""
     known = [choice for choice in choices("material") if choice != "parts"]  # its parts are no one specimen
     if name not in known:
         raise ValueError(f"MATERIAL is {name!r}; take one of {', '.join(known)}")

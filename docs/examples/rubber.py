@@ -2,8 +2,9 @@
 
     PYTHONPATH=. .venv/bin/python docs/examples/rubber.py
 
-The truth: `rubber_two` with E 6e5 Pa, branches of 2e5 Pa and 8 s, 1e5 Pa and 0.2 s. Histories are computed on ten times the
-rows that are written. Noise is 1 % of the largest value of a curve, correlated by 0.5 from row to row; seed 0.
+The truth: `rubber_two` with E 6e5 Pa, branches of 2e5 Pa and 8 s, 1e5 Pa and 0.2 s. Histories are computed on ten
+times the rows that are written. Noise is 1 % of the largest value of a curve, correlated by 0.5 from row to row; seed
+0.
 """
 
 from pathlib import Path

@@ -3,15 +3,16 @@
     minimise sum_i mean_j ((measured_ij - predicted_ij)/scale_i)^2,   scale_i = root mean square of measured_i
 
 so that every test counts alike, whatever its unit and its number of rows; the root of a test's share is its error. The
-parameters are theta of `learning/fields.py` (logarithms); derivatives are exact (`materials/histories.py`), steps those of a
-trust region within bounds (SciPy; Branch, Coleman and Li 1999).
+parameters are theta of `learning/fields.py` (logarithms); derivatives are exact (`materials/histories.py`), steps
+those of a trust region within bounds (SciPy; Branch, Coleman and Li 1999).
 
 Relaxation times start spread over the times that the tables span, in five ways, all moduli at the stiffness that the
 curves show. Minima other than the best that explain the tests as well are told: two valleys. Where a parameter is not
 determined, every interval is walked out to where the tests object (`profile.py`).
 
-Bounds: moduli 1e-4 to 1e4 times the stiffness of the curves; relaxation times from a tenth of the shortest step to a hundred
-times the longest test, beyond which nothing would tell them; K/mu of Poisson's ratio from 2/3 to 5000, nu 0 to 0.4999.
+Bounds: moduli 1e-4 to 1e4 times the stiffness of the curves; relaxation times from a tenth of the shortest step to a
+hundred times the longest test, beyond which nothing would tell them; K/mu of Poisson's ratio from 2/3 to 5000, nu 0 to
+0.4999.
 """
 
 import itertools
@@ -71,8 +72,8 @@ def relative_error(test: LabTest, prediction: Prediction) -> float:
 
 
 def fit(material: AbstractMaterial, field: GlobalField, tests: list[LabTest], *, log: Log) -> Fits:
-    """Raises ValueError in one line if there are fewer rows than parameters, a parameter is of a kind that is not fitted, or
-    no start can be loaded as the tests are."""
+    """Raises ValueError in one line if there are fewer rows than parameters, a parameter is of a kind that is not
+    fitted, or no start can be loaded as the tests are."""
     count = len(field.names)
     rows = sum(len(test.time) for test in tests)
     if rows <= count:
@@ -231,9 +232,9 @@ def _values(field: GlobalField, theta: np.ndarray) -> dict[str, float]:
 
 
 def as_good(best: Fit, parameters: int) -> float:
-    """The largest sum of squares that the tests, worth as many independent rows as they are, cannot tell from the best, so
-    many parameters being free (F test, 90 %). At most a quarter more: where a law cannot follow a curve, its residuals are
-    hardly worth a row, and any other would do."""
+    """The largest sum of squares that the tests, worth as many independent rows as they are, cannot tell from the
+    best, so many parameters being free (F test, 90 %). At most a quarter more: where a law cannot follow a curve, its
+    residuals are hardly worth a row, and any other would do."""
     left = freedom(best)
     return best.cost * (1 + min(parameters / left * float(stats.f.ppf(LEVEL, parameters, left)), MOST)) + 1e-20
 
@@ -244,7 +245,8 @@ def freedom(fit: Fit) -> float:
 
 
 def apart(one: Fit, other: Fit) -> bool:
-    """Whether two fits are two answers: not the same with its branches in another order, nor two points of one flat valley."""
+    """Whether two fits are two answers: not the same with its branches in another order, nor two points of one flat
+    valley."""
 
     def ordered(fit: Fit) -> list[list[float]]:
         """Logarithms of the ends, branches in the order of their relaxation times."""

@@ -1,16 +1,17 @@
 """What curves tell of parameters: a 90 % interval that is true although residuals in a curve are correlated.
 
-theta minimises sum_i |r_i|^2 over the tests i, r_i = (measured - predicted) of test i in its own scale, J = dr/dtheta. What
-makes the residuals of one curve (noise, drift, a law that is not quite that of the specimen) is taken for an AR(1) process
-along its rows, S_i = s_i^2 rho_i^|j - k|, apart for each test; tests are independent. Then (sandwich estimate)
+theta minimises sum_i |r_i|^2 over the tests i, r_i = (measured - predicted) of test i in its own scale, J = dr/dtheta.
+What makes the residuals of one curve (noise, drift, a law that is not quite that of the specimen) is taken for an
+AR(1) process along its rows, S_i = s_i^2 rho_i^|j - k|, apart for each test; tests are independent. Then (sandwich
+estimate)
 
     C = A^-1 B A^-1,   A = sum J_i^T J_i,   B = sum J_i^T S_i J_i
     n_i' = n_i (1 - rho_i)/(1 + rho_i)          independent rows that the curve is worth
     s_i^2 = mean r_i^2  n_i'/(n_i' - h_i),      h_i = tr(J_i A^-1 J_i^T) n_i'/n_i, the parameters that test i pays for
 
-with Student's t of sum (n_i' - h_i) degrees of freedom. Directions that the curves do not see carry no information; what
-the bounds of the fit allow (a uniform distribution between them, by its variance) is added to all of them, so that an
-interval never reaches beyond.
+with Student's t of sum (n_i' - h_i) degrees of freedom. Directions that the curves do not see carry no information;
+what the bounds of the fit allow (a uniform distribution between them, by its variance) is added to all of them, so
+that an interval never reaches beyond.
 
 Rows of the prescribed column are taken as exact. White (1980); Newey and West (1987); Andrews (1991) for AR(1) plug-in.
 """
@@ -53,7 +54,8 @@ def interval(
     slopes: list[Float[np.ndarray, "_ p"]],
     bounds: tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]],
 ) -> Interval:
-    """Of a fit theta within its bounds. `residuals` and `slopes` are of the tests; rows that tell nothing are left out."""
+    """Of a fit theta within its bounds. `residuals` and `slopes` are of the tests; rows that tell nothing are left
+    out."""
     A = sum((J.T @ J for J in slopes), np.zeros((len(theta), len(theta))))
     rho = [correlation(r) for r in residuals]
     inverse = np.linalg.pinv(A, rcond=1e-12, hermitian=True)

@@ -1,7 +1,7 @@
 """What a fit leaves behind: a material for `conf/material`, the numbers as csv, a page and a picture.
 
-material.yaml     the material, its 90 % intervals as comments      intervals.csv, errors.csv    the same numbers, for programs
-fit.md            for people; written last, so that who finds it finds everything
+material.yaml     the material, its 90 % intervals as comments      intervals.csv, errors.csv    the same numbers, for
+programs fit.md            for people; written last, so that who finds it finds everything
 """
 
 import csv

@@ -1,7 +1,7 @@
 """What a material answers in the tests of a laboratory, and how that changes with its parameters.
 
-All tests are run side by side (`materials/histories.py`), each from rest; the first row of a table is reached by one more
-step, as long as the table says.
+All tests are run side by side (`materials/histories.py`), each from rest; the first row of a table is reached by one
+more step, as long as the table says.
 """
 
 from dataclasses import dataclass

@@ -2,9 +2,10 @@
 
     C_i(x) = min over the other parameters of the sum of squares with theta_i = x,   ends: C_i(x) = limit
 
-An interval from derivatives holds where the curves tell all parameters; where they do not tell one of them, the best fit
-itself is an accident of the noise, and so are the derivatives there. Each parameter is walked from the best towards either
-bound, all others fitted again from where the last point left them (profile likelihood; Venzon and Moolgavkar 1988).
+An interval from derivatives holds where the curves tell all parameters; where they do not tell one of them, the best
+fit itself is an accident of the noise, and so are the derivatives there. Each parameter is walked from the best
+towards either bound, all others fitted again from where the last point left them (profile likelihood; Venzon and
+Moolgavkar 1988).
 """
 
 from collections.abc import Callable

@@ -11,8 +11,8 @@
 
 The first line that does not begin with # names the columns, each with its unit in brackets. Tension and compression:
 `stretch` (length/length at rest) or `strain` (stretch - 1), with `nominal stress` (force/area at rest) or `true stress`
-(force/area now). Simple shear: `shear` (an angle's tangent) with `shear stress`. Other columns are not allowed: nothing is
-silently left aside. Between two rows the machine is taken to move at a constant rate.
+(force/area now). Simple shear: `shear` (an angle's tangent) with `shear stress`. Other columns are not allowed:
+nothing is silently left aside. Between two rows the machine is taken to move at a constant rate.
 """
 
 import csv

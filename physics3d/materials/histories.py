@@ -4,17 +4,17 @@
     shear      x = X + g Y
     prescribed: the stretch a, the shear g, or a stress: nominal tau_11/a, true tau_11/J, in shear tau_12     [Pa]
 
-One row of a table is one step of the model, F_next = (I + M) F, as in `driver.py`, which is the plain twin of this. What
-is not prescribed (b, a, g) is found in the kernel, row by row, by a secant in a bracket, to rounding; a load that is
-prescribed is borne by every row.
+One row of a table is one step of the model, F_next = (I + M) F, as in `driver.py`, which is the plain twin of this.
+What is not prescribed (b, a, g) is found in the kernel, row by row, by a secant in a bracket, to rounding; a load that
+is prescribed is borne by every row.
 
-Derivatives with respect to the coefficients c are carried forward. With z the state, u what was found and g(z, u, c) = 0
-the conditions that it meets, a step z' = f(z, u, c) gives
+Derivatives with respect to the coefficients c are carried forward. With z the state, u what was found and g(z, u, c) =
+0 the conditions that it meets, a step z' = f(z, u, c) gives
 
     du = -g_u^-1 (g_z dz + g_c dc),   dz' = f_z dz + f_u du + f_c dc
 
-The partial derivatives are those of a single step, by its exact adjoint, of all rows and all tests at once; what is left
-to do one after another is a product of small matrices per row. Cost: that of the rows.
+The partial derivatives are those of a single step, by its exact adjoint, of all rows and all tests at once; what is
+left to do one after another is a product of small matrices per row. Cost: that of the rows.
 """
 
 import functools
@@ -242,7 +242,8 @@ def _kernel(function: wp.Function) -> wp.Kernel:
         p: int, r: int, mode: int, dt: real, axial: real, guess: real, scale: real,
         coefficients: wp.array2d(dtype=real), H: wp.array2d(dtype=mat33), memory: wp.array3d(dtype=real),
     ):  # fmt: skip
-        """(side, H and tau there, whether it is free); the memory of row r is that there. Nothing is sought in shear."""
+        """(side, H and tau there, whether it is free); the memory of row r is that there. Nothing is sought in
+        shear."""
         # a number given to another name is the same variable in Warp; real(x) is a copy of it
         side, before, miss_before, slope = real(guess), real(guess), real(0.0), real(scale)
         lower, upper = real(-0.9), real(2.0)

@@ -175,8 +175,8 @@ def test_fewer_rows_than_parameters_is_an_error():
 
 @pytest.mark.parametrize("rho", [0.0, 0.7])
 def test_intervals_cover_the_truth(rho, rng):
-    """200 draws of two noisy curves, fitted by SciPy with the closed form: the truth is inside for 80 to 97 % of them, of
-    each parameter, and with correlated noise an interval that takes rows as independent would not."""
+    """200 draws of two noisy curves, fitted by SciPy with the closed form: the truth is inside for 80 to 97 % of them,
+    of each parameter, and with correlated noise an interval that takes rows as independent would not."""
     t = [np.geomspace(0.02, 10, 60), np.linspace(0.1, 5, 40)]
     true = np.log([LONG, BRANCH, TIME])
 

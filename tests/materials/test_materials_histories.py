@@ -101,7 +101,8 @@ def test_short_tests_beside_long_ones_are_those_alone():
 
 
 def test_a_load_that_cannot_be_borne_is_said():
-    """What would stretch it by more than a factor of eleven in one row is no test; the one beside it does not suffer."""
+    """What would stretch it by more than a factor of eleven in one row is no test; the one beside it does not
+    suffer."""
     _, c = coefficients(VISCO, 2)
     given = torch.linspace(0, -1, 8).double()[:, None] * torch.tensor([-1e9, 1e2])
     done = histories.histories(VISCO, c, schedule([NOMINAL, NOMINAL], given))

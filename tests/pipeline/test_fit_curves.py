@@ -85,7 +85,8 @@ def test_what_cannot_be_fitted_is_one_line(folder, tmp_path, capsys, words, code
 
 @pytest.mark.parametrize("name", [choice for choice in choices("material") if choice != "parts"])
 def test_every_configured_material_loads_and_obeys_its_limits(name):
-    """Its start is allowed, what it learns and ties can be learned, and a branch is as compressible as its comment says."""
+    """Its start is allowed, what it learns and ties can be learned, and a branch is as compressible as its comment
+    says."""
     material, field, config = configured(name)
     material.check_parameters(field.start)
     assert set(field.start) == set(material.parameters) and field.groups
@@ -97,8 +98,8 @@ def test_every_configured_material_loads_and_obeys_its_limits(name):
 
 
 def test_the_example_is_what_it_says():
-    """The tables of docs/examples/rubber are those of their truth, but for their noise: 1 % of the largest value is 1 to 3
-    % of the mean one. A load, a rest before the first row, compression, cycles: all of the reader at once."""
+    """The tables of docs/examples/rubber are those of their truth, but for their noise: 1 % of the largest value is 1
+    to 3 % of the mean one. A load, a rest before the first row, compression, cycles: all of the reader at once."""
     material, field, _ = configured("rubber_two")
     theta = np.array([np.log(TRUTH[group[0]] / float(field.start[group[0]])) for group in field.groups])
     tests = read_folder(ROOT / "docs" / "examples" / "rubber")
