@@ -74,9 +74,7 @@ def fit_curves(folder: Path, name: str, unseen: tuple[str, ...], out: Path) -> N
         log.info(f"{'fitted' if row.fitted else 'unseen'} {row.test.name}: error {100 * row.error:.3g} %")
     for other in fits.others:
         values = ", ".join(f"{key} {other.values[key]:.4g}" for key in other.intervals)
-        log.warn(
-            f"two valleys: {values} explains the tests as well; a test that both answer differently would settle it"
-        )
+        log.warn(f"two valleys: {values} explain the tests as well; a test that both answer otherwise would settle it")
     log.info(f"written {done}, material.yaml and previews/curves.png")
 
 

@@ -109,7 +109,8 @@ def fit(material: AbstractMaterial, field: GlobalField, tests: list[LabTest], *,
     least = min(cost for _, cost in looked)
     polished = sorted((descend(x, POLISH) for x, cost in looked if cost <= RIVAL * least), key=lambda pair: pair[1])
     valleys = [_fit(material, field, x, cost, tests, bounds) for x, cost in polished]
-    best, others = valleys[0], []
+    best = valleys[0]
+    others: list[Fit] = []
     if best.undetermined:
         walked = ends(best.theta, bounds, lambda x: both(x)[0], lambda x: both(x)[1], as_good(best, 1))
         best = _named(field, best.theta, best.cost, widened(best.interval, *walked, bounds))
@@ -145,7 +146,7 @@ def residuals(tests: list[LabTest], predictions: list[Prediction]) -> tuple[list
 
 def stiffness(tests: list[LabTest]) -> float:
     """Largest secant modulus of the curves, stress over strain by their root mean squares [Pa]."""
-    return max(np.linalg.norm(t.stress) / np.linalg.norm(t.deformation - t.rest) for t in tests)
+    return max(float(np.linalg.norm(t.stress) / np.linalg.norm(t.deformation - t.rest)) for t in tests)
 
 
 def span_of_times(tests: list[LabTest]) -> tuple[float, float]:
@@ -199,7 +200,7 @@ def starts(material: AbstractMaterial, field: GlobalField, tests: list[LabTest],
 
 def _softer(test: LabTest, prediction: Prediction) -> float:
     """By what the moduli have to be multiplied for the curve to have its size."""
-    ratio = np.linalg.norm(test.measured) / max(np.linalg.norm(prediction.measured), 1e-300)
+    ratio = np.linalg.norm(test.measured) / max(float(np.linalg.norm(prediction.measured)), 1e-300)
     return float(ratio if test.control == "deformation" else 1 / ratio)
 
 
@@ -254,8 +255,11 @@ def apart(one: Fit, other: Fit) -> bool:
             [n for n in fit.intervals if _suffix(n) == s and ("branch" in n or _is_time(n))] for s in ("", "_2", "_3")
         ]
         own = [n for n in fit.intervals if not any(n in b for b in branches)]
-        key = lambda names: -max((fit.values[n] for n in names if _is_time(n)), default=0.0)
-        names = own + list(itertools.chain(*sorted((b for b in branches if b), key=key)))
+
+        def slowness(names: list[str]) -> float:
+            return -max((fit.values[n] for n in names if _is_time(n)), default=0.0)
+
+        names = own + list(itertools.chain(*sorted((b for b in branches if b), key=slowness)))
         found = []
         for n in names:
             # Poisson's ratio by what is missing to 1/2

@@ -19,9 +19,15 @@ from physics3d.laboratory.tables import LabTest
 from physics3d.log import Log
 
 CORRELATED = (
-    "Intervals are of 90 %. Residuals along a curve are correlated, and one row does not count as one measurement: each "
+    "Intervals are of 90 %. Residuals along a curve are correlated, a row does not count as one measurement: each "
     "curve's are taken for an AR(1) process (sandwich estimate, `physics3d/laboratory/interval.py`). What the machine "
     "prescribed is taken as exact, as are the size of the specimen and parameters that are not fitted."
+)
+
+ERRORS = (
+    "Errors are root mean squares of the residual over that of what was measured (stress; stretch - 1 or shear where "
+    "stress was controlled). Correlation is that of the residual from one row to the next: near 1 the material cannot "
+    "follow the curve, near 0 what is left is noise."
 )
 
 
@@ -54,7 +60,8 @@ def row(test: LabTest, prediction: Prediction, start: Prediction, correlation: f
 
 def write(material: str, config: dict[str, Any], fits: Fits, rows: list[Row], *, log: Log) -> Path:
     """All files into the folder of the log; the path of fit.md."""
-    for name in (done := "fit.md", "material.yaml", "intervals.csv", "errors.csv"):
+    done = "fit.md"
+    for name in (done, "material.yaml", "intervals.csv", "errors.csv"):
         log.path(name).unlink(missing_ok=True)
     log.image("curves", curves(rows))
     best, seen = fits.best, [r.test.name for r in rows if r.fitted]
@@ -114,14 +121,7 @@ def as_page(material: str, fits: Fits, rows: list[Row]) -> str:
         role = "fitted" if r.fitted else "**unseen**"
         q = "" if r.correlation is None else f"{r.correlation:.2f}"
         lines.append(f"| {r.test.name} | {role} | {r.test.control} | {len(r.test.time)} | {numbers} | {q} |")
-    lines += [
-        "",
-        "Errors are root mean squares of the residual over that of what was measured (stress; stretch - 1 or shear",
-    ]
-    lines += [
-        "where stress was controlled). Correlation is that of the residual from one row to the next: near 1 the material"
-    ]
-    lines += ["cannot follow the curve, near 0 what is left is noise.", ""]
+    lines += ["", ERRORS, ""]
     if not any(not r.fitted for r in rows):
         lines += ["No test was held out (UNSEEN=<name>): these errors say how well curves are drawn, not foretold.", ""]
     for fit in fits.others:

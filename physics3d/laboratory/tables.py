@@ -114,12 +114,12 @@ def _columns(name: str, cells: list[str]) -> list[tuple[str, str]]:
             )
         columns.append((quantity, unit))
     names = [quantity for quantity, _ in columns]
-    for what, allowed in (("time", ("time",)), ("deformation", DEFORMATIONS), ("stress", STRESSES)):
-        given = [n for n in names if n in allowed]
-        if not given:
-            raise ValueError(f"{name}: no column of {what}; add one of {', '.join(f'{n} [unit]' for n in allowed)}")
-        if len(given) > 1:
-            raise ValueError(f"{name}: columns {' and '.join(given)} are both there; keep one of them")
+    for what, choices in (("time", ("time",)), ("deformation", DEFORMATIONS), ("stress", STRESSES)):
+        found = [n for n in names if n in choices]
+        if not found:
+            raise ValueError(f"{name}: no column of {what}; add one of {', '.join(f'{n} [unit]' for n in choices)}")
+        if len(found) > 1:
+            raise ValueError(f"{name}: columns {' and '.join(found)} are both there; keep one of them")
     if ("shear" in names) != ("shear stress" in names):
         raise ValueError(f"{name}: {names} mixes shear and tension; shear goes with shear stress")
     return columns

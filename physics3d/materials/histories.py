@@ -247,7 +247,7 @@ def _kernel(function: wp.Function) -> wp.Kernel:
         # a number given to another name is the same variable in Warp; real(x) is a copy of it
         side, before, miss_before, slope = real(guess), real(guess), real(0.0), real(scale)
         lower, upper = real(-0.9), real(2.0)
-        found = int(0)
+        found = int(0)  # noqa: UP018, RUF046 -- a variable, to Warp
         H_next, tau = mat33(), mat33()
         for tried in range(80):
             if found == 0:
@@ -305,7 +305,7 @@ def _kernel(function: wp.Function) -> wp.Kernel:
                 if mode == wp.static(SHEAR_STRESS):
                     lower = real(-10.0)
                 H_next, tau = mat33(), mat33()
-                found = int(0)
+                found = int(0)  # noqa: UP018, RUF046 -- a variable, to Warp
                 for tried in range(80):
                     if found == 0:
                         side_tried, H_tried, tau_tried, freed = free_side(

@@ -195,7 +195,7 @@ def test_intervals_cover_the_truth(rho, rng):
         for i, x in enumerate(t):
             white = rng.standard_normal(len(x) + 200) * np.sqrt(1 - rho**2)
             data.append(curve(true, x) + 0.02 * (1 + i) * signal.lfilter([1], [1, -rho], white)[200:])
-        residual = lambda theta: np.concatenate([curve(theta, x) - y for x, y in zip(t, data)])
+        residual = lambda theta, data=data: np.concatenate([curve(theta, x) - y for x, y in zip(t, data)])
         found = optimize.least_squares(residual, true, lambda theta: np.concatenate([slope(theta, x) for x in t])).x
         told = interval(
             found, [curve(found, x) - y for x, y in zip(t, data)], [slope(found, x) for x in t],

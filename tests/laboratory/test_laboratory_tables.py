@@ -17,7 +17,8 @@ def written(folder: Path, text: str, name: str = "pull.csv") -> Path:
 
 
 def test_units_and_columns_are_read(tmp_path):
-    text = "# a note: of someone\n# control: stress\n# start: ramp 2.5\ntrue stress [MPa], strain [%] ,time [min]\n1,10,0\n1,20,1\n"
+    text = "# a note: of someone\n# control: stress\n# start: ramp 2.5\n"
+    text += "true stress [MPa], strain [%] ,time [min]\n1,10,0\n1,20,1\n"
     test = read_table(written(tmp_path, text))
     np.testing.assert_allclose(test.time, [0, 60])
     np.testing.assert_allclose(test.deformation, [1.1, 1.2])
@@ -37,7 +38,7 @@ BAD = {
     "line 3: stretch is 'much', no number": GOOD.replace("1,1.1,2", "1,much,2"),
     "line 3: 4 cells for 3 columns": GOOD.replace("1,1.1,2", "1,1.1,2,5"),
     "line 4: time 1 s does not increase": GOOD.replace("2,1.2,3", "1,1.2,3"),
-    "columns nominal stress and true stress are both there": "time [s],stretch [1],nominal stress [Pa],true stress [Pa]\n0,1,0,0\n1,2,3,4\n",
+    "columns nominal stress and true stress are both there": GOOD.replace(",nominal", ",true stress [Pa],nominal"),
     "line 3: the stretch is -0.1": GOOD.replace("1.1", "-0.1"),
     "mixes shear and tension": GOOD.replace("stretch", "shear"),
     "does not start at rest": GOOD.replace("0,1,0", "0,1.1,1"),
@@ -62,5 +63,5 @@ def test_what_cannot_be_is_one_line(tmp_path, message):
 def test_a_folder_without_tables_is_said(tmp_path):
     with pytest.raises(ValueError, match=r"holds no \.csv; put a table"):
         read_folder(tmp_path)
-    with pytest.raises(ValueError, match="no folder at .*; give DATA"):
+    with pytest.raises(ValueError, match=r"no folder at .*; give DATA"):
         read_folder(tmp_path / "none")
