@@ -12,16 +12,18 @@ FORMAT ?= ply
 FRAME ?=
 SIZE ?=
 LENGTH ?=
+MATERIAL ?=
+UNSEEN ?=
 PORT ?= 5000
 PYTHON ?= python3
 # these may hold anything, quotes, semicolons and dollar signs too: they are taken as they stand, and reach commands by the
 # environment, never as a part of a line that a shell or make reads
-$(foreach name,SCENE PROFILE METHOD DATA ARGS PORT PYTHON REAL PRED OUT FORMAT FRAME SIZE LENGTH,$(eval override $(name) := $$(value $(name))))
-export SCENE PROFILE METHOD DATA ARGS PORT PYTHON REAL PRED OUT FORMAT FRAME SIZE LENGTH
+$(foreach name,SCENE PROFILE METHOD DATA ARGS PORT PYTHON REAL PRED OUT FORMAT FRAME SIZE LENGTH MATERIAL UNSEEN,$(eval override $(name) := $$(value $(name))))
+export SCENE PROFILE METHOD DATA ARGS PORT PYTHON REAL PRED OUT FORMAT FRAME SIZE LENGTH MATERIAL UNSEEN
 
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup run score twin export film report ui view test newest bench lint handbook architecture clean
+.PHONY: help setup run score twin export film report ui view test newest bench lint handbook architecture clean fit-curves
 py := .venv/bin/python
 # torch's own threads spin beside those of the renderer and the simulator: OMP_NUM_THREADS=1 unless you say otherwise
 threads := OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1}
@@ -70,6 +72,8 @@ film: $(ready) ## the motion from a camera that goes round it: [OUT=<new .mp4>] 
 
 report: $(ready) ## one HTML page of what SCENE=... left, or, without SCENE, of all runs: [OUT=<new .html>]
 	@$(threads) $(with_args) -m pipeline.web $(if $(chosen),$(of_run))
+fit-curves: $(ready) ## a material from tables of a test machine: DATA=<folder of csv> MATERIAL=<name> [UNSEEN=<test>] [OUT=<folder>]
+	@$(threads) $(py) -m pipeline.fit_curves
 
 ui: $(ready) ## MLflow: prints the address of the page that compares runs, and serves it
 	@$(py) -m pipeline.tracking .

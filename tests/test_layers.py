@@ -29,6 +29,7 @@ ROOMS = {
     "physics3d.gaussians": (),
     "physics3d.mpm": ("physics3d.world", "physics3d.materials", "physics3d.boundaries"),
     "physics3d.modes": ("physics3d.world", "physics3d.materials", "physics3d.boundaries"),
+    "physics3d.laboratory": ("physics3d.materials", "physics3d.learning"),
     "physics3d.priors": (),
     "physics3d.motion": (),
 }

@@ -20,13 +20,14 @@ _REAL = {torch.float32: wp.float32, torch.float64: wp.float64}
 
 def advance(
     material: AbstractMaterial,
-    dt: float,
+    dt: float | Float[Tensor, " n"],
     L: Float[Tensor, "n 3 3"],
     H: Float[Tensor, "n 3 3"],
     coefficients: Float[Tensor, "k n"],
     memory: Float[Tensor, "m n"],
 ) -> tuple[Float[Tensor, "n 3 3"], Float[Tensor, "n 3 3"], Float[Tensor, "m n"]]:
-    """One step of n points over dt [s] with the velocity gradient L [1/s]: (H_next, tau [Pa], memory_next).
+    """One step of n points over dt [s], one for all or each its own, with the velocity gradient L [1/s]: (H_next, tau
+    [Pa], memory_next).
 
     All tensors are of one dtype; coefficients of one column are those of every point. Differentiable."""
     return _Advance.apply(material, dt, L, H, coefficients, memory)
@@ -39,7 +40,7 @@ def _kernel(function: wp.Function, real: type) -> wp.Kernel:
     @wp.kernel(module="unique")
     def material_points(
         # in
-        dt: real,  # [s]
+        dt: wp.array(dtype=real),  # [n] [s]
         L: wp.array(dtype=mat33),  # [n] velocity gradient [1/s]
         H: wp.array(dtype=mat33),  # [n] deformation minus identity [1]
         coefficients: wp.array2d(dtype=real),  # [k, n] of the material
@@ -50,7 +51,7 @@ def _kernel(function: wp.Function, real: type) -> wp.Kernel:
         memory_next: wp.array2d(dtype=real),  # [m, n]
     ):
         p = wp.tid()
-        H_p, tau_p = function(p, dt, L[p], H[p], coefficients, memory, memory_next)
+        H_p, tau_p = function(p, dt[p], L[p], H[p], coefficients, memory, memory_next)
         H_next[p] = H_p
         tau[p] = tau_p
 
@@ -86,23 +87,30 @@ class _Outputs:
 
 class _Advance(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, material: AbstractMaterial, dt: float, L: Tensor, H: Tensor, coefficients: Tensor, memory: Tensor):
+    def forward(
+        ctx, material: AbstractMaterial, dt: float | Tensor, L: Tensor, H: Tensor, coefficients: Tensor, memory: Tensor
+    ):
         start_warp()
         n, real = len(H), _REAL[H.dtype]
         L, H, columns, memory = (t.detach().contiguous() for t in (L, H, coefficients.expand(-1, n), memory))
         inputs = _Inputs(L=L, H=H, coefficients=columns, memory=memory)
+        steps = torch.as_tensor(dt, dtype=H.dtype).detach().expand(n).contiguous()
         outputs = _Outputs(H_next=torch.zeros_like(H), tau=torch.zeros_like(H), memory_next=torch.zeros_like(memory))
-        ctx.kernel, ctx.dt, ctx.real = _kernel(material.advance(real), real), dt, real
+        ctx.kernel, ctx.real = _kernel(material.advance(real), real), real
         ctx.one_column = coefficients.shape[1] == 1
-        ctx.save_for_backward(L, H, columns, memory, outputs.H_next, outputs.tau, outputs.memory_next)
+        ctx.save_for_backward(steps, L, H, columns, memory, outputs.H_next, outputs.tau, outputs.memory_next)
         wp.launch(
-            ctx.kernel, n, inputs=[real(dt), *inputs.arrays(real)], outputs=outputs.arrays(real), device=str(H.device)
+            ctx.kernel,
+            n,
+            inputs=[wp.from_torch(steps, dtype=real), *inputs.arrays(real)],
+            outputs=outputs.arrays(real),
+            device=str(H.device),
         )
         return outputs.H_next, outputs.tau, outputs.memory_next
 
     @staticmethod
     def backward(ctx, adj_H_next: Tensor, adj_tau: Tensor, adj_memory_next: Tensor):
-        L, H, columns, memory, H_next, tau, memory_next = ctx.saved_tensors
+        steps, L, H, columns, memory, H_next, tau, memory_next = ctx.saved_tensors
         adjoint = _Inputs(
             L=torch.zeros_like(L),
             H=torch.zeros_like(H),
@@ -118,7 +126,10 @@ class _Advance(torch.autograd.Function):
         wp.launch(
             ctx.kernel,
             len(H),
-            inputs=[real(ctx.dt), *_Inputs(L=L, H=H, coefficients=columns, memory=memory).arrays(real)],
+            inputs=[
+                wp.from_torch(steps, dtype=real),
+                *_Inputs(L=L, H=H, coefficients=columns, memory=memory).arrays(real),
+            ],
             outputs=_Outputs(H_next=H_next, tau=tau, memory_next=memory_next).arrays(real),
             adj_inputs=[None, *adjoint.arrays(real)],
             adj_outputs=given.arrays(real),

@@ -1,0 +1,1 @@
+"""Material parameters from tables of a test machine: reading, fit, intervals, page."""
