@@ -7,16 +7,17 @@ ARGS ?=
 REAL ?=
 PRED ?=
 OUT ?=
+RESULT ?=
 PORT ?= 5000
 PYTHON ?= python3
 # these may hold anything, quotes, semicolons and dollar signs too: they are taken as they stand, and reach commands by the
 # environment, never as a part of a line that a shell or make reads
-$(foreach name,SCENE PROFILE METHOD DATA ARGS PORT PYTHON REAL PRED OUT,$(eval override $(name) := $$(value $(name))))
-export SCENE PROFILE METHOD DATA ARGS PORT PYTHON REAL PRED OUT
+$(foreach name,SCENE PROFILE METHOD DATA ARGS PORT PYTHON REAL PRED OUT RESULT,$(eval override $(name) := $$(value $(name))))
+export SCENE PROFILE METHOD DATA ARGS PORT PYTHON REAL PRED OUT RESULT
 
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup run score twin ui view test newest bench lint architecture clean
+.PHONY: help setup run why pin unpin collect score twin ui view test newest bench lint architecture clean
 py := .venv/bin/python
 # torch's own threads spin beside those of the renderer and the simulator: OMP_NUM_THREADS=1 unless you say otherwise
 threads := OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1}
@@ -27,7 +28,7 @@ quietly := PIP_DISABLE_PIP_VERSION_CHECK=1 SAM2_BUILD_CUDA=0
 pip := PIP_CONSTRAINT=constraints.txt $(quietly) $(py) -m pip install --quiet
 
 help: ## this list
-	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):[^#]*## (.*)/  make \1\t\2/' | expand -t 16
+	@grep -hE '^[a-z -]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+)[a-z -]*:[^#]*## (.*)/  make \1\t\2/' | expand -t 16
 	@echo
 	@echo "  SCENE=$$SCENE PROFILE=$$PROFILE METHOD=$$METHOD DATA=$$DATA ARGS=\"$$ARGS\""
 	@echo '  scenes: $(basename $(notdir $(wildcard conf/scene/*.yaml)))'
@@ -47,6 +48,15 @@ $(ready): pyproject.toml constraints.txt
 
 run: $(ready) ## the pipeline on SCENE; what has been computed before is reused
 	@$(threads) $(with_args) -m pipeline scene="$$SCENE" profile="$$PROFILE" method="$$METHOD" $${DATA:+data="$$DATA"}
+
+why: $(ready) ## which stages `make run` would compute, and what has changed; runs nothing
+	@$(with_args) -m pipeline.why scene="$$SCENE" profile="$$PROFILE" method="$$METHOD" $${DATA:+data="$$DATA"}
+
+pin unpin: $(ready) ## keep a result whatever is cleaned or collected: make pin RESULT=learn/<fingerprint>
+	@$(py) -m pipeline.shelf $@ "$$RESULT"
+
+collect: $(ready) ## remove the results that no run in MLflow refers to (delete runs on its page first)
+	@$(py) -m pipeline.shelf collect .
 
 score: $(ready) ## any two videos compared: REAL=<clip> PRED=<clip> [OUT=<folder>]
 	@$(threads) $(py) -m pipeline.score
@@ -85,5 +95,6 @@ lint: $(ready) ## style and types
 architecture: $(ready) ## draw docs/architecture.png and its table from the imports
 	@$(py) docs/draw_architecture.py
 
-clean: ## remove results and caches (artifacts, MLflow, Prefect); keeps .venv
-	@rm -rf artifacts mlartifacts mlflow.db* .mlflow.lock .prefect .warp .pytest_cache .ruff_cache .mypy_cache .hypothesis build *.egg-info
+clean: ## remove results and caches (artifacts, MLflow, Prefect), showing their sizes; keeps .venv and pinned results
+	@"$$(test -x $(py) && echo $(py) || echo "$$PYTHON")" -m pipeline.shelf clean artifacts mlartifacts mlflow.db* .mlflow.lock .prefect \
+		.warp .pytest_cache .ruff_cache .mypy_cache .hypothesis build *.egg-info

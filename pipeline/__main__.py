@@ -21,6 +21,7 @@ from pipeline.fingerprint import installed
 from pipeline.flow import execute, up_to_date
 from pipeline.report import report
 from pipeline.settings import CONF, GROUPS, SettingsError, choices, compose, described
+from pipeline.shelf import using
 from pipeline.stage import Filed, StageError
 from pipeline.tracking import Tracking, address, git_commit, mend
 from pipeline.words import literal_paths
@@ -34,6 +35,7 @@ Runs the pipeline on a scene; what has been computed before is reused. Keys are 
     output=<folder>             where artifacts/, mlflow.db and mlartifacts/ go
     device=auto|cpu|cuda        seed=0
     verify=true                 check stored results by content, not only by size
+    use.learn=<fingerprint>     take that result in place of the stage
     --help  --config            this text; the configuration as composed, without running
 """
 
@@ -101,7 +103,8 @@ def run(config: dict[str, Any], picked: dict[str, str], started: float) -> int:
         hits[filed.step.name] = filed.hit
 
     try:
-        plan, _ = execute(config, shelf, output / ".prefect", device(config["device"]), verify, done)
+        with using(shelf):
+            plan, _ = execute(config, shelf, output / ".prefect", device(config["device"]), verify, done)
         scores = report(plan, hits)
         status = "FINISHED"
     except KeyboardInterrupt:

@@ -33,9 +33,8 @@ def report(plan: Plan, hits: dict[str, bool]) -> dict[str, float]:
     for name, step in steps.items():
         told = manifest(step)
         memory = f"{told['peak_rss_bytes'] / 1e9:.1f} GB"
-        stages.add_row(
-            name, "reused" if hits[name] else "computed", f"{told['seconds']:.1f}", memory, str(_near(step.folder))
-        )
+        how = "taken" if step.taken else "reused" if hits[name] else "computed"
+        stages.add_row(name, how, f"{told['seconds']:.1f}", memory, str(_near(step.folder)))
     for name, why in plan.left_out.items():
         stages.add_row(name, "left out", "", "", why)
     console.print(stages)

@@ -86,7 +86,7 @@ class Tracking:
         tags = {
             "mlflow.parentRunId": self.run,
             "stage": step.stage,
-            "cache": "hit" if filed.hit else "miss",
+            "cache": "taken" if step.taken else "hit" if filed.hit else "miss",
             "key": step.fingerprint,
             "artifact": os.path.relpath(folder, self.output),
             "process": _process(os.getpid()),
