@@ -121,17 +121,7 @@ def execute(
     """Run the graph under Prefect; `done` is called after each step. Raises StageError with one line."""
 
     stages: dict[str, Any] = {}
-    idle = {name: "a result is taken in its place" for name, key in config.get("use", {}).items() if key}
-
-    def check() -> None:
-        """Build every stage once, so that a bad value is found before hours of work, not after."""
-        try:
-            stages.update({name: build(config.get(name), device, name) for name in STAGES})
-        except ValueError as error:
-            raise StageError(str(error)) from error
-        suit(stages, getattr(getattr(stages["capture"], "source", None), "outline", None), idle)
-
-    with server(home, meanwhile=check):
+    with server(home, meanwhile=lambda: stages.update(built(config, device))):
         from prefect import flow
 
         @flow(name="physics3d", flow_run_name=config["scene"]["name"], persist_result=False)
@@ -139,13 +129,13 @@ def execute(
             filed: dict[Step, Filed] = {}
 
             def compute(step: Step) -> None:
-                filed[step] = as_task(step, device, verify)([filed[s] for s in _steps(step.inputs)])
+                filed[step] = as_task(step, device, verify)([filed[s] for s in before(step)])
                 done(filed[step])
 
             capture = first(config, shelf)
             compute(capture)
             whole = plan(config, capture)
-            suit(stages, getattr(load(capture, device), "outline", None), idle | whole.left_out)
+            suit(stages, getattr(load(capture, device), "outline", None), idle(config) | whole.left_out)
             for name, why in whole.left_out.items():
                 print(f"{name:>16} | left out: {why}", flush=True)
             for step in whole.steps[1:]:
@@ -153,6 +143,21 @@ def execute(
             return whole, list(filed.values())
 
         return physics3d()
+
+
+def built(config: dict[str, Any], device: str) -> dict[str, Any]:
+    """Every stage, built once, so that a bad value is found before hours of work, not after. Raises StageError."""
+    try:
+        stages = {name: build(config.get(name), device, name) for name in STAGES}
+    except ValueError as error:
+        raise StageError(str(error)) from error
+    suit(stages, getattr(getattr(stages["capture"], "source", None), "outline", None), idle(config))
+    return stages
+
+
+def idle(config: dict[str, Any]) -> dict[str, str]:
+    """Stages that are not run because a result is taken in their place."""
+    return {name: "a result is taken in its place" for name, key in config.get("use", {}).items() if key}
 
 
 def suit(stages: dict[str, Any], outline: Any, left_out: dict[str, str]) -> None:
@@ -165,7 +170,7 @@ def suit(stages: dict[str, Any], outline: Any, left_out: dict[str, str]) -> None
                 raise StageError(f"{name}: {error}") from error
 
 
-def _steps(inputs: Any) -> list[Step]:
+def before(step: Step) -> list[Step]:
     """The steps behind a step's inputs."""
-    sources = [s for i in inputs for s in (i.values() if isinstance(i, dict) else [i])]
+    sources = [s for i in step.inputs for s in (i.values() if isinstance(i, dict) else [i])]
     return [s.step if isinstance(s, Part) else s for s in sources if s is not None]

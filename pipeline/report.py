@@ -39,7 +39,6 @@ def report(plan: Plan, hits: dict[str, bool]) -> dict[str, float]:
         stages.add_row(name, "left out", "", "", why)
     console.print(stages)
 
-    headline: dict[str, float] = {}
     truth = peek(steps["capture"].folder)["truth"]
     start = _parameters(steps["guess"])
     learned = _parameters(steps["learn"]) if "learn" in steps else None
@@ -47,7 +46,6 @@ def report(plan: Plan, hits: dict[str, bool]) -> dict[str, float]:
     for name, value in start.items():
         row = [f"{value:.4g}"]
         if learned:
-            headline[f"learned/{name}"] = learned[name]
             row.append(f"{learned[name]:.4g}")
         if truth:
             row.append(f"{truth[name]:.4g}" if name in truth else "?")
@@ -62,7 +60,6 @@ def report(plan: Plan, hits: dict[str, bool]) -> dict[str, float]:
         scores = table("score", *metrics)
         for name, row in stored["values"].items():
             scores.add_row(name, *("-" if row.get(m) is None else f"{row[m]:.4g}" for m in metrics))
-            headline |= {f"score/{name}/{m}": v for m, v in row.items() if v is not None and math.isfinite(v)}
         console.print(scores)
         for name, note in stored["notes"].items():
             console.print(f"{name}: {note}", markup=False)
@@ -73,7 +70,17 @@ def report(plan: Plan, hits: dict[str, bool]) -> dict[str, float]:
         shelf, folder = steps["render"].shelf, steps["render"].folder
         (shelf / ".latest").write_text(f"{folder.relative_to(shelf)}\n")  # so that it holds when the shelf is moved
     console.print(f"previews  {_near(steps['render'].folder / 'previews')}   (make view)", markup=False)
-    return headline
+    return headline(plan)
+
+
+def headline(plan: Plan) -> dict[str, float]:
+    """Learned parameters and scores of a plan whose steps are all filed, by name."""
+    steps = {step.name: step for step in plan.steps}
+    found = {f"learned/{k}": v for k, v in _parameters(steps["learn"]).items()} if "learn" in steps else {}
+    for judge in ("foretell", "evaluate"):
+        for name, row in peek(steps[judge].folder)["values"].items() if judge in steps else ():
+            found |= {f"score/{name}/{m}": v for m, v in row.items() if v is not None and math.isfinite(v)}
+    return found
 
 
 def _parameters(step: Step) -> dict[str, float]:

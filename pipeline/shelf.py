@@ -36,10 +36,8 @@ def main(words: list[str]) -> int:
         match words:
             case ["clean", *paths]:
                 clean([Path(path) for path in paths], Path("artifacts"))
-            case ["collect"]:
-                collect(Path("."))
-            case ["collect", folder]:
-                collect(Path(folder))
+            case ["collect", *folder] if len(folder) < 2:
+                collect(Path(*folder))
             case ["pin", result]:
                 pin(Path("artifacts"), result)
             case ["unpin", result]:

@@ -28,13 +28,16 @@ from typing import Any
 
 from pipeline.fingerprint import (
     LIBRARIES,
+    code,
     file_digest,
     fingerprint,
     hashed,
     installed,
+    libraries,
     made_of,
     recall,
     remember,
+    targets,
 )
 
 MANIFEST = "manifest.json"
@@ -288,15 +291,40 @@ def build(config: Any, device: str, where: str = "") -> Any:
 
 
 def as_task(step: Step, device: str, verify: bool) -> Callable[..., Filed]:
-    """The step as a Prefect task; call it with the results of the steps before it, so that Prefect draws the graph."""
+    """The step as a Prefect task; call it with the results of the steps before it, so that Prefect draws the graph.
+
+    It may run in another process, or on another machine, with the same code and the same shelf. `device` is `auto`
+    where that machine is to choose.
+    """
     from prefect import task
     from prefect.cache_policies import NO_CACHE
 
     @task(name=step.name, cache_policy=NO_CACHE, persist_result=False)
     def stage(after: list[Filed]) -> Filed:
-        return run(step, device, verify)
+        if reason := strange(step):
+            raise StageError(f"{step.name}: {reason}")
+        return run(step, here(device), verify)
 
     return stage
+
+
+def here(device: str) -> str:
+    """auto -> cuda if this machine has one, else cpu."""
+    import torch
+
+    return ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
+
+
+def strange(step: Step) -> str | None:
+    """Why this machine would not compute what the step's fingerprint says, with the remedy; None if it would."""
+    if not step.shelf.is_dir():
+        return f"{platform.node()} sees no folder {step.shelf}; share it under that path, or output=<a shared folder>"
+    names = tuple(sorted(targets(step.config)))
+    for kind, mine in (("code", code(names)), ("libraries", libraries(names))):
+        asked = mine if step.taken else step.made_of[kind]
+        if other := sorted(k for k in mine.keys() | asked.keys() if mine.get(k) != asked.get(k)):
+            return f"{platform.node()} has other {kind} ({other[0]}); install there what is installed here"
+    return None
 
 
 def _compute(step: Step, device: str, verify: bool) -> dict[str, Any]:
