@@ -25,6 +25,7 @@ import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -37,7 +38,7 @@ from pipeline.report import headline
 from pipeline.server import HERE, server
 from pipeline.settings import SettingsError, compose
 from pipeline.shelf import using
-from pipeline.stage import Filed, StageError, Step, as_task, load, manifest
+from pipeline.stage import Filed, StageError, Step, as_task, here, load, manifest
 from pipeline.tracking import Tracking, address, mend
 from pipeline.words import literal_paths
 
@@ -228,7 +229,7 @@ class _Work:
 
     def check(self) -> None:
         """Build every stage of every variant once. Raises StageError."""
-        self.stages = {v: built(v.config, v.config["device"]) for v in self.variants}
+        self.stages = {v: built(v.config, here(v.config["device"])) for v in self.variants}
         self.plans = {v: Plan([first(v.config, self.shelf)]) for v in self.variants}
 
     def go_on(self, crew: Crew) -> None:
@@ -244,22 +245,28 @@ class _Work:
                     self._advance(variant, futures, ended)
                 if not self.variants:
                     return
-                self._take(*ended.get())
+                try:
+                    self._take(*ended.get())
+                except WorkerDied:
+                    while not ended.empty():  # what others have filed meanwhile counts
+                        with suppress(WorkerDied):
+                            self._take(*ended.get())
+                    raise
 
         sweep()
 
     def _advance(self, variant: Variant, futures: dict[Path, Any], ended: queue.SimpleQueue) -> None:
         """Hand over every step of a variant that can begin, and see whether the variant has ended."""
-        whole = self.plans[variant]
+        whole, error = self.plans[variant], ""
         if len(whole.steps) == 1 and whole.steps[0].folder in self.filed:
             try:
                 capture = whole.steps[0]
                 whole = self.plans[variant] = plan(variant.config, capture)
                 outline = getattr(load(capture, "cpu"), "outline", None)
                 suit(self.stages[variant], outline, idle(variant.config) | whole.left_out)
-            except StageError as error:
-                self.failed[whole.steps[-1].folder] = str(error)
-        for step in whole.steps:
+            except StageError as unsuited:
+                error = str(unsuited)
+        for step in whole.steps if not error else ():
             first_ones = before(step)
             if bad := next((s.folder for s in first_ones if s.folder in self.failed), None):
                 self.failed.setdefault(step.folder, self.failed[bad])
@@ -269,10 +276,8 @@ class _Work:
                 task = as_task(step, variant.config["device"], variant.config["verify"])
                 future = futures[step.folder] = task.submit(after)
                 future.add_done_callback(lambda future, step=step: ended.put((step, future)))
-        error = next((self.failed[s.folder] for s in whole.steps if s.folder in self.failed), "")
-        if (
-            all(s.folder in self.filed or s.folder in self.failed for s in whole.steps) and len(whole.steps) > 1
-        ) or error:
+        error = error or next((self.failed[s.folder] for s in whole.steps if s.folder in self.failed), "")
+        if error or (len(whole.steps) > 1 and all(s.folder in self.filed for s in whole.steps)):
             self.variants.remove(variant)
             self.done(variant, whole, self.filed, error)
 
