@@ -144,5 +144,5 @@ def test_a_machine_with_other_code_or_without_the_shelf_refuses(tmp_path):
     assert "sees no folder" in (strange(step) or "")
     (tmp_path / "artifacts").mkdir()
     assert strange(step) is None
-    step.made_of["libraries"]["torch"] = "1.0"
+    step.made_of["libraries"] = {**step.made_of["libraries"], "torch": "1.0"}
     assert "has other libraries (torch); install there what is installed here" in (strange(step) or "")
