@@ -14,21 +14,31 @@ SIZE ?=
 LENGTH ?=
 MATERIAL ?=
 UNSEEN ?=
-PORT ?= 5000
+RESULT ?=
+SCENES ?=
+METHODS ?=
+SEEDS ?=
+RUNNER ?=
+WORKERS ?=
+ADDRESS ?=
+PORT ?=
 PYTHON ?= python3
 # these may hold anything, quotes, semicolons and dollar signs too: they are taken as they stand, and reach commands by the
 # environment, never as a part of a line that a shell or make reads
-$(foreach name,SCENE PROFILE METHOD DATA ARGS PORT PYTHON REAL PRED OUT FORMAT FRAME SIZE LENGTH MATERIAL UNSEEN,$(eval override $(name) := $$(value $(name))))
-export SCENE PROFILE METHOD DATA ARGS PORT PYTHON REAL PRED OUT FORMAT FRAME SIZE LENGTH MATERIAL UNSEEN
+words := SCENE PROFILE METHOD DATA ARGS PYTHON REAL PRED OUT FORMAT FRAME SIZE LENGTH MATERIAL UNSEEN RESULT SCENES METHODS SEEDS RUNNER WORKERS ADDRESS PORT
+$(foreach name,$(words),$(eval override $(name) := $$(value $(name))))
+export $(words)
 
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup run score twin export film report ui view test newest bench lint handbook architecture clean fit-curves
+.PHONY: help setup run why sweep pin unpin collect score twin fit-curves export film report ui graph view test newest bench lint \
+	handbook architecture clean
 py := .venv/bin/python
 # torch's own threads spin beside those of the renderer and the simulator: OMP_NUM_THREADS=1 unless you say otherwise
 threads := OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1}
 with_args := $(py) -m pipeline.words
 ready := .venv/.ready
+extras := pipeline,priors,sam,sfm,view,export,dask,dev
 # one version of everything, in isolated builds too; sam2 without its optional CUDA extension
 quietly := PIP_DISABLE_PIP_VERSION_CHECK=1 SAM2_BUILD_CUDA=0
 pip := PIP_CONSTRAINT=constraints.txt $(quietly) $(py) -m pip install --quiet
@@ -37,14 +47,14 @@ pip := PIP_CONSTRAINT=constraints.txt $(quietly) $(py) -m pip install --quiet
 of_run := scene="$$SCENE" profile="$$PROFILE" method="$$METHOD" $${DATA:+data="$$DATA"}
 
 help: ## this list
-	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):[^#]*## (.*)/  make \1\t\2/' | expand -t 16
+	@grep -hE '^[a-z -]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+)[a-z -]*:[^#]*## (.*)/  make \1\t\2/' | expand -t 16
 	@echo
 	@echo "  SCENE=$$SCENE PROFILE=$$PROFILE METHOD=$$METHOD DATA=$$DATA ARGS=\"$$ARGS\""
 	@echo '  scenes: $(basename $(notdir $(wildcard conf/scene/*.yaml)))'
 
 setup: $(ready) ## .venv with everything in it (5 to 10 minutes, 7 GB, once)
 
-$(ready): pyproject.toml constraints.txt
+$(ready): pyproject.toml setup.py constraints.txt
 	@"$$PYTHON" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo 'error: Python >= 3.11 is needed; make setup PYTHON=<path of one>'; exit 1; }
 	@test -x $(py) || "$$PYTHON" -m venv .venv || \
@@ -52,11 +62,24 @@ $(ready): pyproject.toml constraints.txt
 	@echo 'setting up .venv (5 to 10 minutes, once): build tools, torch, the rest'
 	@$(pip) pip setuptools wheel
 	@$(pip) torch torchvision
-	@$(pip) --no-build-isolation -e '.[dev,sfm,view,export,dask]'
+	@$(pip) --no-build-isolation -e '.[$(extras)]'
 	@touch $@
 
 run: $(ready) ## the pipeline on SCENE; what has been computed before is reused
 	@$(threads) $(with_args) -m pipeline $(of_run)
+
+why: $(ready) ## which stages `make run` would compute, and what has changed; runs nothing
+	@$(with_args) -m pipeline.why $(of_run)
+
+sweep: $(ready) ## many runs at once: SCENES=carnation,ball METHODS=... SEEDS=0,1 RUNNER=thread|process|dask WORKERS=2 [ADDRESS=tcp://...]
+	@$(threads) $(with_args) -m pipeline.sweep scenes="$$SCENES" methods="$$METHODS" seeds="$$SEEDS" runner="$$RUNNER" workers="$$WORKERS" \
+		address="$$ADDRESS" profile="$$PROFILE" $${DATA:+data="$$DATA"}
+
+pin unpin: $(ready) ## keep a result whatever is cleaned or collected: make pin RESULT=learn/<fingerprint>
+	@$(py) -m pipeline.shelf $@ "$$RESULT"
+
+collect: $(ready) ## remove the results that no run in MLflow refers to (delete runs on its page first)
+	@$(py) -m pipeline.shelf collect .
 
 score: $(ready) ## any two videos compared: REAL=<clip> PRED=<clip> [OUT=<folder>]
 	@$(threads) $(py) -m pipeline.score
@@ -78,6 +101,9 @@ fit-curves: $(ready) ## a material from tables of a test machine: DATA=<folder o
 ui: $(ready) ## MLflow: prints the address of the page that compares runs, and serves it
 	@$(py) -m pipeline.tracking .
 
+graph: $(ready) ## Prefect's picture of the last run: prints its address, and serves it
+	@$(py) -m pipeline.graph .
+
 view: ## the video and previews of the last run
 	@folder=artifacts/$$(cat artifacts/.latest 2>/dev/null || echo nowhere); \
 	test -d "$$folder" || { echo "error: nothing rendered yet; make run SCENE=$$SCENE"; exit 1; }; \
@@ -91,7 +117,7 @@ newest: ## the tests with the newest version of everything, in an environment of
 	@test -x .venv-newest/bin/python || "$$PYTHON" -m venv .venv-newest
 	@$(quietly) .venv-newest/bin/python -m pip install --quiet --upgrade pip setuptools wheel
 	@$(quietly) .venv-newest/bin/python -m pip install --quiet --upgrade --upgrade-strategy eager torch torchvision
-	@$(quietly) .venv-newest/bin/python -m pip install --quiet --upgrade --upgrade-strategy eager --no-build-isolation -e '.[dev,sfm,view,export,dask]'
+	@$(quietly) .venv-newest/bin/python -m pip install --quiet --upgrade --upgrade-strategy eager --no-build-isolation -e '.[$(extras)]'
 	@OMP_NUM_THREADS=1 .venv-newest/bin/python -m pipeline.words -m pytest -n 2 --dist loadfile
 
 bench: $(ready) bench-speed bench-renderer bench-filling bench-embedding bench-simulation bench-swaying bench-stability bench-segmentation bench-reconstruction bench-motion bench-real ## measurements with plots, into docs/results; one alone: make bench-<name>
@@ -109,5 +135,6 @@ handbook: $(ready) ## write docs/handbook.md from conf/handbook.yaml
 architecture: $(ready) ## draw docs/architecture.png and its table from the imports
 	@$(py) docs/draw_architecture.py
 
-clean: ## remove results and caches (artifacts, MLflow, Prefect); keeps .venv
-	@rm -rf artifacts mlartifacts mlflow.db* .mlflow.lock .prefect .warp .pytest_cache .ruff_cache .mypy_cache .hypothesis build *.egg-info
+clean: ## remove results and caches (artifacts, MLflow, Prefect), showing their sizes; keeps .venv and pinned results
+	@"$$(test -x $(py) && echo $(py) || echo "$$PYTHON")" -m pipeline.shelf clean artifacts sweeps mlartifacts mlflow.db* .mlflow.lock .prefect \
+		.warp .pytest_cache .ruff_cache .mypy_cache .hypothesis build *.egg-info

@@ -18,6 +18,8 @@ LINES_EVERY = 15.0  # between two lines of progress where there is no screen [s]
 
 
 class Log:
+    """Lines, curves, previews and progress of one computation, kept in `folder`, unless that is None."""
+
     def __init__(self, folder: Path | None, *, name: str = "", quiet: bool = False):
         self.folder = folder
         self.name = name

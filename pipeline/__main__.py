@@ -21,7 +21,8 @@ from pipeline.fingerprint import installed
 from pipeline.flow import execute, up_to_date
 from pipeline.report import report
 from pipeline.settings import CONF, GROUPS, SettingsError, choices, compose, described
-from pipeline.stage import Filed, StageError
+from pipeline.shelf import using
+from pipeline.stage import Filed, StageError, here
 from pipeline.tracking import Tracking, address, git_commit, mend
 from pipeline.words import literal_paths
 
@@ -34,6 +35,7 @@ Runs the pipeline on a scene; what has been computed before is reused. Keys are 
     output=<folder>             where artifacts/, mlflow.db and mlartifacts/ go
     device=auto|cpu|cuda        seed=0
     verify=true                 check stored results by content, not only by size
+    use.learn=<fingerprint>     take that result in place of the stage
     --help  --config            this text; the configuration as composed, without running
 """
 
@@ -55,7 +57,7 @@ def main(words: list[str]) -> int:
         if "--config" in words:
             show(config)
             return 0
-        return run(config, picked, started)
+        return run(config, picked, words, started)
     except SettingsError as error:
         return _fail(str(error), 2)
     except StageError as error:
@@ -72,7 +74,7 @@ def main(words: list[str]) -> int:
         return _fail(f"{text} (PHYSICS3D_TRACEBACK=1 shows where)", 1)
 
 
-def run(config: dict[str, Any], picked: dict[str, str], started: float) -> int:
+def run(config: dict[str, Any], picked: dict[str, str], words: list[str], started: float) -> int:
     output = Path(config["output"]).expanduser().resolve()
     shelf = output / "artifacts"
     verify = config["verify"]
@@ -87,11 +89,10 @@ def run(config: dict[str, Any], picked: dict[str, str], started: float) -> int:
     if _free(output) < LEAST_SPACE:  # the server would wait for its database, rather than end
         raise StageError(_full(output))
     _kernels(output)
-    _quiet()
+    quiet()
     hits: dict[str, bool] = {}
     tracking: Tracking | None = None
-    tags = {**picked, "git": git_commit(CONF.parent)}
-    name = " ".join(picked[g] for g in ("scene", "method", "profile"))
+    name, tags = title(picked, config, words)
     status, scores = "FAILED", {}
 
     def done(filed: Filed) -> None:
@@ -101,7 +102,8 @@ def run(config: dict[str, Any], picked: dict[str, str], started: float) -> int:
         hits[filed.step.name] = filed.hit
 
     try:
-        plan, _ = execute(config, shelf, output / ".prefect", device(config["device"]), verify, done)
+        with using(shelf):
+            plan, _ = execute(config, shelf, output / ".prefect", device(config["device"]), verify, done)
         scores = report(plan, hits)
         status = "FINISHED"
     except KeyboardInterrupt:
@@ -120,13 +122,20 @@ def run(config: dict[str, Any], picked: dict[str, str], started: float) -> int:
     return 0
 
 
+def title(picked: dict[str, str], config: dict[str, Any], words: list[str]) -> tuple[str, dict[str, str]]:
+    """What a run is called where runs are compared, and its tags: scene, method and profile, and what else was said."""
+    named = ("scene", "method", "profile")
+    said = " ".join(word for word in words if word.partition("=")[0] not in (*named, "data", "output", "seed"))
+    name = " ".join([*(picked[group] for group in named), f"seed {config['seed']}", said]).strip()
+    tags = {**picked, "seed": str(config["seed"]), "said": said, "git": git_commit(CONF.parent)}
+    return name[:200], tags
+
+
 def device(asked: str) -> str:
     """auto -> cuda if there is one, else cpu. Raises SettingsError if CUDA is asked for and absent."""
-    import torch
-
-    if asked not in ("auto", "cpu") and not (asked.startswith("cuda") and torch.cuda.is_available()):
+    if asked not in ("auto", "cpu") and not (asked.startswith("cuda") and here("auto") == "cuda"):
         raise SettingsError(f"device={asked}: not available here; use device=cpu or device=auto")
-    return ("cuda" if torch.cuda.is_available() else "cpu") if asked == "auto" else asked
+    return here(asked)
 
 
 def usage() -> str:
@@ -172,7 +181,7 @@ def _full(output: Path) -> str:
     return f"the disk is full ({free}); free some space or write elsewhere with output=<folder>"
 
 
-def _quiet() -> None:
+def quiet() -> None:
     """Libraries talk to themselves; the person watching reads our lines."""
     import warp
 

@@ -2,6 +2,8 @@
 
     fingerprint = sha256( configuration,  code it reaches,  libraries,  fingerprints of its inputs,  files it reads )
 
+What is hashed, `made_of`, is filed with the result, so that `make why` can tell what has changed since.
+
 - Configuration: without `device`, which must not change the result beyond round-off, and without where the data lies.
 - Code: the syntax trees (no comments, no docstrings, no line numbers) of the modules named by `_target_` anywhere in
   the configuration, and of every module of this project that they import, at any depth, also from inside functions.
@@ -48,20 +50,39 @@ LIBRARIES = {
 }
 
 
-def fingerprint(
-    config: dict[str, Any], inputs: list[str], digests: Path | None = None, files: Iterable[tuple[str, Path]] = ()
-) -> str:
-    """Sixteen hexadecimal digits for a stage with this `config` and inputs of these fingerprints.
+def made_of(
+    config: dict[str, Any], inputs: list[Any], digests: Path | None = None, files: Iterable[tuple[str, Path]] = ()
+) -> dict[str, Any]:
+    """Everything that the result of a stage with this `config` and inputs of these fingerprints depends on:
+
+        config     without what does not matter, data and local weights replaced by "data"
+        code       module -> digest
+        libraries  name -> major.minor
+        inputs     as given
+        data       entry, or entry/file below it, or what a source says it reads -> digest
 
     `files` are what its sources say they read, by a name that does not change when all of it is moved; `digests` is the
     file in which digests of data files are remembered. Raises ValueError if a path does not exist.
     """
-    code = tuple(sorted(targets(config)))
+    targeted = tuple(sorted(targets(config)))
     known = Digests(digests)
-    contents = [(name, known.of(path) if path.is_file() else "missing") for name, path in sorted(files)]
-    parts = [_essential(config, known), code_digest(code), libraries(code), inputs, contents]
+    data = {name: known.of(path) if path.is_file() else "missing" for name, path in sorted(files)}
+    essential = _essential(config, "", data, known)
     known.keep()
+    parts = {"config": essential, "code": code(targeted), "libraries": libraries(targeted)}
+    return parts | {"inputs": inputs, "data": data}
+
+
+def hashed(parts: dict[str, Any]) -> str:
+    """Sixteen hexadecimal digits for what a result is made of."""
     return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()[:16]
+
+
+def fingerprint(
+    config: dict[str, Any], inputs: list[Any], digests: Path | None = None, files: Iterable[tuple[str, Path]] = ()
+) -> str:
+    """As `made_of`, hashed."""
+    return hashed(made_of(config, inputs, digests, files))
 
 
 def targets(config: Any) -> set[str]:
@@ -73,10 +94,9 @@ def targets(config: Any) -> set[str]:
 
 
 @cache
-def code_digest(names: tuple[str, ...], root: Path = ROOT) -> str:
-    """Hash of the syntax trees of these modules (or classes in them) and of all project modules they import."""
-    trees = [(m, _tree_digest(_file(m, root))) for m in _reached(names, root)]
-    return hashlib.sha256(json.dumps(trees).encode()).hexdigest()[:16]
+def code(names: tuple[str, ...], root: Path = ROOT) -> dict[str, str]:
+    """Module -> digest of its syntax tree: these modules (or classes in them), and project modules they import."""
+    return {module: _tree_digest(_file(module, root))[:16] for module in _reached(names, root)}
 
 
 @cache
@@ -159,20 +179,30 @@ def _tree_digest(path: Path) -> str:
     return hashlib.sha256(ast.dump(tree).encode()).hexdigest()
 
 
-def _essential(config: Any, known: "Digests") -> Any:
+def _essential(config: Any, where: str, data: dict[str, str], known: "Digests") -> Any:
+    """The configuration without what does not matter; digests of the data it names are added to `data`."""
+
+    def below(key: Any) -> str:
+        return f"{where}.{key}".lstrip(".")
+
     if isinstance(config, list | tuple):
-        return [_essential(v, known) for v in config]
+        return [_essential(v, below(i), data, known) for i, v in enumerate(config)]
     if not isinstance(config, dict):
         return config
-    essential = {k: _essential(v, known) for k, v in config.items() if k != "device"}
+    essential = {k: _essential(v, below(k), data, known) for k, v in config.items() if k != "device"}
     for key, value in essential.items():
         if not isinstance(value, str):
             continue
         if key.split("_")[-1] == "path":
-            essential[key] = content_digest(Path(value), known)
+            data |= contents(below(key), Path(value), known)
+            essential[key] = "data"
         elif "_target_" in config and key in ("model", "weights"):
             here = Path(value).expanduser()
-            essential[key] = content_digest(here, known) if here.exists() else [value, _commit(value)]
+            if here.exists():
+                data |= contents(below(key), here, known)
+                essential[key] = "data"
+            elif commit := _commit(value):
+                data[below(key)] = commit
     return essential
 
 
@@ -186,15 +216,14 @@ def _commit(name: str) -> str | None:
     return None
 
 
-def content_digest(path: Path, known: "Digests") -> str:
-    """Hash of a file, or of the names and contents of all files under a folder that are not hidden."""
+def contents(name: str, path: Path, known: "Digests") -> dict[str, str]:
+    """Digest of a file under `name` and its suffix, or of all files below a folder that are not hidden."""
     path = path.expanduser()
     if not path.exists():
         raise ValueError(f"no such file or folder: {path}; say where the data lies with DATA=<folder> (data=<folder>)")
     if not path.is_dir():
-        return path.suffix + known.of(path)
-    lines = [(file.relative_to(path).as_posix(), known.of(file)) for file in _files(path)]
-    return hashlib.sha256(json.dumps(lines).encode()).hexdigest()
+        return {f"{name}{path.suffix}": known.of(path)}
+    return {name: "folder"} | {f"{name}/{f.relative_to(path).as_posix()}": known.of(f) for f in _files(path)}
 
 
 def file_digest(path: Path) -> str:

@@ -5,7 +5,7 @@
                                  guess (the configured material) -> learn's start, and what is compared with
 
 `plan` writes the graph down without running anything, so that "is everything up to date?" is answered in a second;
-`execute` runs it as a Prefect flow, one task per step.
+`execute` runs it as a Prefect flow, one task per step. An entry `use.<step>` puts a filed result in a step's place.
 """
 
 from collections.abc import Callable
@@ -31,17 +31,23 @@ def first(config: dict[str, Any], shelf: Path, ask: bool = True) -> Step:
 
     `ask` sources what they read, see `Step.of`, here and in `plan`.
     """
-    return Step.of("capture", "capture", config["capture"], (), shelf, ask)
+    return _step("capture", "capture", config, (), shelf, ask)
 
 
-def plan(config: dict[str, Any], capture: Step, ask: bool = True) -> Plan:
-    """The graph of a scene whose capture has been filed."""
-    without = left_out(config, peek(capture.folder), capture.shelf)
+def _step(name: str, stage: str, config: dict[str, Any], inputs: tuple[Any, ...], shelf: Path, ask: bool) -> Step:
+    if key := config.get("use", {}).get(name):
+        return Step.take(name, stage, key, shelf)
+    return Step.of(name, stage, config[stage], inputs, shelf, ask)
+
+
+def plan(config: dict[str, Any], capture: Step, ask: bool = True, found: dict[str, Any] | None = None) -> Plan:
+    """The graph of a scene whose capture has been filed, or, as far as can be known, is like `found`, see `peek`."""
+    found = found or peek(capture.folder)
+    without = left_out(config, found, capture.shelf)
     steps = [capture]
 
     def step(name: str, *inputs: Any, stage: str | None = None) -> Step:
-        stage = stage or name
-        steps.append(Step.of(name, stage, config[stage], inputs, capture.shelf, ask))
+        steps.append(_step(name, stage or name, config, inputs, capture.shelf, ask))
         return steps[-1]
 
     guess = step("guess")
@@ -51,7 +57,7 @@ def plan(config: dict[str, Any], capture: Step, ask: bool = True) -> Plan:
     estimate = guess if "learn" in without else step("learn", capture, gaussians, body)
     trajectory = step("simulate", body, estimate)
     video = step("render", capture, gaussians, body, trajectory)
-    if _unknown(peek(capture.folder)) and not {"foretell", "learn"} & set(without):
+    if _unknown(found) and not {"foretell", "learn"} & set(without):
         step("foretell", capture, gaussians, body, estimate)
     if "evaluate" not in without:
         videos, estimates = {"learned": video}, {"learned": estimate}
@@ -62,6 +68,9 @@ def plan(config: dict[str, Any], capture: Step, ask: bool = True) -> Plan:
             videos["initial"] = step("render_initial", capture, gaussians, body, motion, stage="render")
             estimates["initial"] = guess
         step("evaluate", capture, videos, estimates)
+    names = [s.name for s in steps]
+    if idle := [name for name, key in config.get("use", {}).items() if key and name not in names]:
+        raise StageError(f"use.{idle[0]} takes the place of no step of this scene; set use.{idle[0]}=null")
     return Plan(steps, without)
 
 
@@ -112,16 +121,7 @@ def execute(
     """Run the graph under Prefect; `done` is called after each step. Raises StageError with one line."""
 
     stages: dict[str, Any] = {}
-
-    def check() -> None:
-        """Build every stage once, so that a bad value is found before hours of work, not after."""
-        try:
-            stages.update({name: build(config.get(name), device, name) for name in STAGES})
-        except ValueError as error:
-            raise StageError(str(error)) from error
-        suit(stages, getattr(getattr(stages["capture"], "source", None), "outline", None), {})
-
-    with server(home, meanwhile=check):
+    with server(home, meanwhile=lambda: stages.update(built(config, device))):
         from prefect import flow
 
         @flow(name="physics3d", flow_run_name=config["scene"]["name"], persist_result=False)
@@ -129,13 +129,13 @@ def execute(
             filed: dict[Step, Filed] = {}
 
             def compute(step: Step) -> None:
-                filed[step] = as_task(step, device, verify)([filed[s] for s in _steps(step.inputs)])
+                filed[step] = as_task(step, device, verify)([filed[s] for s in before(step)])
                 done(filed[step])
 
             capture = first(config, shelf)
             compute(capture)
             whole = plan(config, capture)
-            suit(stages, getattr(load(capture, device), "outline", None), whole.left_out)
+            suit(stages, getattr(load(capture, device), "outline", None), idle(config) | whole.left_out)
             for name, why in whole.left_out.items():
                 print(f"{name:>16} | left out: {why}", flush=True)
             for step in whole.steps[1:]:
@@ -143,6 +143,21 @@ def execute(
             return whole, list(filed.values())
 
         return physics3d()
+
+
+def built(config: dict[str, Any], device: str) -> dict[str, Any]:
+    """Every stage, built once, so that a bad value is found before hours of work, not after. Raises StageError."""
+    try:
+        stages = {name: build(config.get(name), device, name) for name in STAGES}
+    except ValueError as error:
+        raise StageError(str(error)) from error
+    suit(stages, getattr(getattr(stages["capture"], "source", None), "outline", None), idle(config))
+    return stages
+
+
+def idle(config: dict[str, Any]) -> dict[str, str]:
+    """Stages that are not run because a result is taken in their place."""
+    return {name: "a result is taken in its place" for name, key in config.get("use", {}).items() if key}
 
 
 def suit(stages: dict[str, Any], outline: Any, left_out: dict[str, str]) -> None:
@@ -155,7 +170,7 @@ def suit(stages: dict[str, Any], outline: Any, left_out: dict[str, str]) -> None
                 raise StageError(f"{name}: {error}") from error
 
 
-def _steps(inputs: Any) -> list[Step]:
+def before(step: Step) -> list[Step]:
     """The steps behind a step's inputs."""
-    sources = [s for i in inputs for s in (i.values() if isinstance(i, dict) else [i])]
+    sources = [s for i in step.inputs for s in (i.values() if isinstance(i, dict) else [i])]
     return [s.step if isinstance(s, Part) else s for s in sources if s is not None]

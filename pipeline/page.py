@@ -10,13 +10,15 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
-from physics3d.checks import Count, Device, Pixels, Seed, Text, complaint
+from physics3d.checks import Count, Device, Like, Pixels, Seed, Text, complaint
 from pipeline.fields import Class, Declared, Unknown, classes, declared
 
 STAGES = ("capture", "guess", "reconstruct", "segment", "fill", "learn", "simulate", "render", "foretell", "evaluate")
+STEPS = (*STAGES, "simulate_initial", "render_initial")  # of a run: the initial material goes through two stages again
 MAY_BE_NULL = ("segment", "learn", "foretell", "evaluate")  # stages that a method may do without
+Key = Annotated[str, Like("[0-9a-f]{1,16}", "the fingerprint of a result, or the beginning of one, in quotes")]
 PLAIN = {  # entries that belong to no class
     "data": Text,
     "output": Text,
@@ -25,6 +27,7 @@ PLAIN = {  # entries that belong to no class
     "verify": bool,
     "twin": {"views": Count, "width": Pixels, "height": Pixels},
     "scene": {"name": Text},
+    "use": {name: Key | None for name in STEPS},
 }
 USED_BY_STAGES = {  # entries that stages take over; those of a class are checked there
     "": ("world", "material", "prior", "masker", "densification", "solid", *STAGES),

@@ -33,23 +33,19 @@ def report(plan: Plan, hits: dict[str, bool]) -> dict[str, float]:
     for name, step in steps.items():
         left = told.told(step)
         memory = f"{left.memory / 1e9:.1f} GB"
-        stages.add_row(
-            name, "reused" if hits[name] else "computed", f"{left.seconds:.1f}", memory, str(_near(step.folder))
-        )
+        how = "taken" if step.taken else "reused" if hits[name] else "computed"
+        stages.add_row(name, how, f"{left.seconds:.1f}", memory, str(_near(step.folder)))
     for name, why in plan.left_out.items():
         stages.add_row(name, "left out", "", "", why)
     console.print(stages)
 
-    headline: dict[str, float] = {}
     rows = told.parameters(plan)
     has_learned, has_truth = "learn" in steps, bool(peek(steps["capture"].folder)["truth"])
-    heads = ["parameter", "start", *(["learned", "with a probability of 90 %"] if has_learned else []), *(["truth"] if has_truth else [])]
+    heads = ["parameter", "start"] + ["learned", "with a probability of 90 %"] * has_learned + ["truth"] * has_truth
     parameters = table(*heads)
     for p in rows:
         row = [f"{p.start:.4g}"]
         if p.learned is not None:
-            headline[f"learned/{p.name}"] = p.learned
-            headline |= {f"{side}/{p.name}": v for side, v in (("low", p.low), ("high", p.high)) if v is not None}
             row += [f"{p.learned:.4g}", p.between]
         if has_truth:
             row.append("?" if p.truth is None else f"{p.truth:.4g}")
@@ -60,7 +56,6 @@ def report(plan: Plan, hits: dict[str, bool]) -> dict[str, float]:
         scores = table("score", *judged.metrics)
         for name, cells in judged.values.items():
             scores.add_row(name, *("-" if cells.get(m) is None else f"{cells[m]:.4g}" for m in judged.metrics))
-            headline |= {f"score/{name}/{m}": v for m, v in cells.items() if v is not None and math.isfinite(v)}
         console.print(scores)
         for name, note in judged.notes.items():
             console.print(f"{name}: {note}", markup=False)
@@ -71,7 +66,20 @@ def report(plan: Plan, hits: dict[str, bool]) -> dict[str, float]:
         shelf, folder = steps["render"].shelf, steps["render"].folder
         (shelf / ".latest").write_text(f"{folder.relative_to(shelf)}\n")  # so that it holds when the shelf is moved
     console.print(f"previews  {_near(steps['render'].folder / 'previews')}   (make view)", markup=False)
-    return headline
+    return headline(plan)
+
+
+def headline(plan: Plan) -> dict[str, float]:
+    """Learned parameters with their intervals, and scores, of a plan whose steps are all filed, by name."""
+    found: dict[str, float] = {}
+    for p in told.parameters(plan):
+        for side, value in (("learned", p.learned), ("low", p.low), ("high", p.high)):
+            if value is not None:
+                found[f"{side}/{p.name}"] = value
+    for judged in told.scores(plan):
+        for name, cells in judged.values.items():
+            found |= {f"score/{name}/{m}": v for m, v in cells.items() if v is not None and math.isfinite(v)}
+    return found
 
 
 def _near(path: Path) -> Path:

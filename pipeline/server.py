@@ -34,10 +34,11 @@ SETTINGS = {
 
 
 @contextmanager
-def server(home: Path, meanwhile: Callable[[], None]) -> Iterator[None]:
+def server(home: Path, meanwhile: Callable[[], object], host: str = "127.0.0.1") -> Iterator[None]:
     """Start a server with its database under `home`, call `meanwhile` while it starts (12 s), stop it at the end.
 
-    Must be entered before Prefect is imported. Raises RuntimeError if the server does not come up.
+    `host` is the address of this machine under which whoever computes can reach it. Must be entered before Prefect is
+    imported. Raises RuntimeError if the server does not come up.
     """
     _allow_files()
     _go_round_proxies()
@@ -52,7 +53,7 @@ def server(home: Path, meanwhile: Callable[[], None]) -> Iterator[None]:
     home.mkdir(parents=True, exist_ok=True)
     with (home / "start.lock").open("w") as lock:  # two first starts at once would both migrate the database
         fcntl.flock(lock, fcntl.LOCK_EX)
-        process, address = _start(home / "server.log")
+        process, address = _start(home / "server.log", host)
         try:
             meanwhile()
             _await(process, f"{address}/health", home / "server.log")
@@ -86,12 +87,12 @@ def _go_round_proxies() -> None:
         os.environ[name] = "*" if useless else ",".join([*listed, *missing])
 
 
-def _start(log: Path) -> tuple[subprocess.Popen, str]:
+def _start(log: Path, host: str) -> tuple[subprocess.Popen, str]:
     with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
+        probe.bind((host, 0))
         port = probe.getsockname()[1]
     serve = [sys.executable, "-m", "uvicorn", "--factory", "prefect.server.api.server:create_app"]
-    options = ["--host", "127.0.0.1", "--port", str(port), "--log-level", "error", "--lifespan", "on"]
+    options = ["--host", host, "--port", str(port), "--log-level", "error", "--lifespan", "on"]
     # "$@" is the server; cat returns when the other end of the pipe is closed
     script = '"$@" </dev/null & server=$!; cat >/dev/null; kill $server; wait $server'
     with log.open("w") as lines:
@@ -103,7 +104,7 @@ def _start(log: Path) -> tuple[subprocess.Popen, str]:
             start_new_session=True,
             env={**os.environ, "PREFECT__SERVER_EPHEMERAL": "1"},
         )
-    return process, f"http://127.0.0.1:{port}/api"
+    return process, f"http://{host}:{port}/api"
 
 
 def _await(process: subprocess.Popen, url: str, log: Path) -> None:

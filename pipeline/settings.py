@@ -9,7 +9,8 @@ from pipeline.fields import Unknown, declared
 from pipeline.fingerprint import ROOT
 from pipeline.page import nearest, problem, set_by
 
-CONF = ROOT / "conf"
+INSTALLED = Path(__file__).resolve().parent / "conf"
+CONF = INSTALLED if INSTALLED.is_dir() else ROOT / "conf"  # beside the packages in a checkout, inside of one in a wheel
 GROUPS = ("scene", "material", "prior", "masker", "densification", "solid", "method", "profile")
 
 

@@ -22,16 +22,19 @@ import time
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
 from pipeline.fingerprint import (
     LIBRARIES,
-    code_digest,
+    code,
     file_digest,
     fingerprint,
+    hashed,
     installed,
+    libraries,
+    made_of,
     recall,
     remember,
     targets,
@@ -60,6 +63,8 @@ class Step:
     inputs: tuple[Any, ...]
     shelf: Path  # the folder artifacts/
     fingerprint: str
+    made_of: dict[str, Any] = field(default_factory=dict)  # what the fingerprint is the hash of
+    taken: bool = False  # `use` says so: this result in place of the stage, which is not run
 
     @classmethod
     def of(
@@ -72,10 +77,25 @@ class Step:
         try:
             digests, keys = shelf / ".digests.json", [_key(i) for i in inputs]
             files = _reads(config, fingerprint(config, keys, digests), shelf / ".reads.json", name, ask)
-            key = fingerprint(config, keys, digests, files)
+            parts = made_of(config, keys, digests, files)
         except (ValueError, OSError) as error:
             raise StageError(f"{name}: {_one_line(error)}") from error
-        return cls(name=name, stage=stage, config=config, inputs=inputs, shelf=shelf, fingerprint=key)
+        rest = {"inputs": inputs, "shelf": shelf, "fingerprint": hashed(parts), "made_of": parts}
+        return cls(name=name, stage=stage, config=config, **rest)
+
+    @classmethod
+    def take(cls, name: str, stage: str, key: str, shelf: Path) -> "Step":
+        """The filed result whose fingerprint begins with `key`, in place of a stage, whatever it was made of.
+
+        Raises StageError if there is none, or more than one.
+        """
+        filed = {path.name for path in (shelf / stage).glob("[!.]*")}
+        found = sorted(name for name in filed if name.startswith(key))
+        if len(found) != 1:
+            there = ", ".join(found or sorted(filed)) or "none"
+            reason = f"{'fits several results' if found else 'is no result'} in {shelf / stage}"
+            raise StageError(f"use.{name} is {key}, which {reason}; take one of: {there}; or use.{name}=null")
+        return cls(name=name, stage=stage, config={}, inputs=(), shelf=shelf, fingerprint=found[0], taken=True)
 
     @property
     def folder(self) -> Path:
@@ -104,7 +124,10 @@ class Filed:
 
 def run(step: Step, device: str, verify: bool = False) -> Filed:
     """Reuse the step's artifact, or compute and file it. Raises StageError with one line naming the step."""
-    if damage(step, verify):
+    reason = damage(step, verify)
+    if reason and step.taken:
+        raise spoilt(step, reason)
+    if reason:
         with _lock(step, wait=True):  # another run may file it while this one waits
             reason = damage(step, verify)
             if reason:
@@ -132,6 +155,12 @@ def damage(step: Step, verify: bool = False) -> str | None:
     except (OSError, ValueError) as error:
         return str(error) or "unreadable"
     return None
+
+
+def spoilt(step: Step, reason: str) -> StageError:
+    """What to say of a taken result that cannot be used."""
+    key = f"use.{step.name}"
+    return StageError(f"{key} is {step.fingerprint}, which is damaged ({reason}); take another result, or {key}=null")
 
 
 def manifest(step: Step) -> dict[str, Any]:
@@ -192,6 +221,8 @@ def load(source: Any, device: str, verify: bool = False) -> Any:
     try:
         return AbstractArtifact.load(source.folder)
     except ArtifactError as error:
+        if source.taken:
+            raise spoilt(source, str(error)) from error
         with _lock(source, wait=True):
             _say(source, f"the stored result is damaged ({error}); computing it again")
             _remove(source.folder)
@@ -260,15 +291,40 @@ def build(config: Any, device: str, where: str = "") -> Any:
 
 
 def as_task(step: Step, device: str, verify: bool) -> Callable[..., Filed]:
-    """The step as a Prefect task; call it with the results of the steps before it, so that Prefect draws the graph."""
+    """The step as a Prefect task; call it with the results of the steps before it, so that Prefect draws the graph.
+
+    It may run in another process, or on another machine, with the same code and the same shelf. `device` is `auto`
+    where that machine is to choose.
+    """
     from prefect import task
     from prefect.cache_policies import NO_CACHE
 
     @task(name=step.name, cache_policy=NO_CACHE, persist_result=False)
     def stage(after: list[Filed]) -> Filed:
-        return run(step, device, verify)
+        if reason := strange(step):
+            raise StageError(f"{step.name}: {reason}")
+        return run(step, here(device), verify)
 
     return stage
+
+
+def here(device: str) -> str:
+    """auto -> cuda if this machine has one, else cpu."""
+    import torch
+
+    return ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
+
+
+def strange(step: Step) -> str | None:
+    """Why this machine would not compute what the step's fingerprint says, with the remedy; None if it would."""
+    if not step.shelf.is_dir():
+        return f"{platform.node()} sees no folder {step.shelf}; share it under that path, or output=<a shared folder>"
+    names = tuple(sorted(targets(step.config)))
+    for kind, mine in (("code", code(names)), ("libraries", libraries(names))):
+        asked = mine if step.taken else step.made_of[kind]
+        if other := sorted(k for k in mine.keys() | asked.keys() if mine.get(k) != asked.get(k)):
+            return f"{platform.node()} has other {kind} ({other[0]}); install there what is installed here"
+    return None
 
 
 def _compute(step: Step, device: str, verify: bool) -> dict[str, Any]:
@@ -412,11 +468,11 @@ def _told(made: Any) -> Iterator[tuple[str, Path]]:
             yield from _told(getattr(made, part.name))
 
 
-def _key(source: Any) -> str:
+def _key(source: Any) -> Any:
     if source is None:
         return "none"
     if isinstance(source, dict):
-        return json.dumps({name: _key(step) for name, step in source.items()}, sort_keys=True)
+        return {name: _key(step) for name, step in source.items()}
     return f"{source.step.fingerprint}.{source.field}" if isinstance(source, Part) else source.fingerprint
 
 
@@ -425,9 +481,8 @@ def _describe(step: Step, device: str) -> dict[str, Any]:
     return {
         "stage": step.stage,
         "fingerprint": step.fingerprint,
-        "code": code_digest(tuple(sorted(targets(step.config)))),
         "config": step.config,
-        "inputs": [_key(i) for i in step.inputs],
+        "made_of": step.made_of,
         "device": device,
         "versions": {"python": platform.python_version()} | versions,
         "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),

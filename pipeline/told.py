@@ -94,7 +94,9 @@ def parameters(plan: Plan) -> list[Parameter]:
     truth = peek(steps["capture"].folder)["truth"]
     learned = means(steps["learn"]) if "learn" in steps else {}
     intervals = peek(steps["learn"].folder).get("intervals", {}) if "learn" in steps else {}
-    sides = lambda name: {key: intervals[name][key] for key in ("low", "high", "determined")} if name in intervals else {}
+    sides = lambda name: (
+        {key: intervals[name][key] for key in ("low", "high", "determined")} if name in intervals else {}
+    )
     return [
         Parameter(name=name, start=value, learned=learned.get(name), truth=truth.get(name), **sides(name))
         for name, value in means(steps["guess"]).items()

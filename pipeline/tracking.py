@@ -1,8 +1,10 @@
 """MLflow: one run per flow, one nested run per stage, replayed from what the stage left in its artifact.
 
-A stage that was reused is replayed too (tag cache=hit), so that every run shows all curves and previews. Headline
-numbers stand on the parent, because parents are what people compare. Tracking may fail, results may not: any error here
-is one warning, and the run goes on without.
+A stage that was reused is replayed too (tag cache=hit), so that every run shows all curves and previews. What people
+compare stands on the parent: headline numbers, seconds per stage (`time/<step>_s`), which of them were reused
+(tag `cache/<step>`), videos, plots, and the load of the machine. The learned material is an object of its own, a logged
+model with its parameters and scores as metrics, so that all materials of all runs can be put in an order. Tracking may
+fail, results may not: any error here is one warning, and the run goes on without.
 
 The database is made beside its place and renamed, under a lock: a kill while MLflow creates its tables, or two first
 runs at once, leave a whole one or none. MLflow stores where pictures lie as absolute addresses, and keeps a run whose
@@ -27,10 +29,14 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from pipeline.stage import Filed
 
 EXPERIMENT = "physics3d"
+KIND = {"mlflow.experimentKind": "custom_model_development"}  # else the page may open on tools for chats and traces
+SHOWN = ("learn", "render", "foretell", "evaluate")  # steps whose videos and plots are attached to the parent as well
+NUMBERED = re.compile(r"(.+)_(\d{5})")  # a preview of a step
 BATCH = 1000  # metrics per request that MLflow takes; 100 for parameters
 
 
@@ -39,7 +45,11 @@ class Tracking:
 
     def __init__(self, output: Path, *, config: dict[str, Any], name: str, tags: dict[str, str]):
         self.output = output.resolve()
+        self.name = name
         self.broken = False
+        self.seconds = {"all": 0.0, "computed": 0.0}  # of the steps, and of those that this run computed
+        self.learned: Filed | None = None
+        self.load: Any = None  # what records the load of the machine
         self._attempt(lambda: self._open(config, name, tags))
 
     def stage(self, filed: Filed) -> None:
@@ -73,20 +83,27 @@ class Tracking:
             known = self.client.get_experiment_by_name(EXPERIMENT)
             store = _store(self.output)
             self.experiment = known.experiment_id if known else self.client.create_experiment(EXPERIMENT, store)
+            for key, value in KIND.items():
+                self.client.set_experiment_tag(self.experiment, key, value)
         tags = {**tags, "process": _process(os.getpid())}
         self.run = self.client.create_run(self.experiment, run_name=name, tags=tags).info.run_id
         params = [Param(key, str(value)[:500]) for key, value in flatten(config).items()]
         for i in range(0, len(params), 100):
             self.client.log_batch(self.run, params=params[i : i + 100])
+        from mlflow.system_metrics.system_metrics_monitor import SystemMetricsMonitor
+
+        self.load = SystemMetricsMonitor(self.run, tracking_uri=database(self.output))
+        self.load.start()
 
     def _replay(self, filed: Filed) -> None:
         from mlflow.entities import Metric
 
         step, folder = filed.step, filed.step.folder
+        cache = "taken" if step.taken else "hit" if filed.hit else "miss"
         tags = {
             "mlflow.parentRunId": self.run,
             "stage": step.stage,
-            "cache": "hit" if filed.hit else "miss",
+            "cache": cache,
             "key": step.fingerprint,
             "artifact": os.path.relpath(folder, self.output),
             "process": _process(os.getpid()),
@@ -108,10 +125,21 @@ class Tracking:
                 self.client.log_artifact(run, str(path))
         self.client.set_terminated(run)
         self.client.log_metric(self.run, f"time/{step.name}_s", filed.manifest["seconds"])
+        self.client.set_tag(self.run, f"cache/{step.name}", cache)
+        self.seconds["all"] += filed.manifest["seconds"]
+        self.seconds["computed"] += 0.0 if filed.hit else filed.manifest["seconds"]
+        if step.name in SHOWN:
+            for path in sorted(folder.glob("*.mp4")):
+                self.client.log_artifact(self.run, str(path), "videos")
+            for path in sorted((folder / "previews").glob("*.png")):
+                if not NUMBERED.fullmatch(path.stem):
+                    self.client.log_artifact(self.run, str(path), f"plots/{step.name}")
+        if step.name == "learn":
+            self.learned = filed
 
     def _preview(self, run: str, path: Path) -> None:
         """Numbered previews become one picture with a slider over steps, the others plain files."""
-        numbered = re.fullmatch(r"(.+)_(\d{5})", path.stem)
+        numbered = NUMBERED.fullmatch(path.stem)
         if not numbered:
             self.client.log_artifact(run, str(path), "previews")
             return
@@ -122,7 +150,37 @@ class Tracking:
     def _close(self, scores: dict[str, float], status: str) -> None:
         for key, value in scores.items():
             self.client.log_metric(self.run, _name(key), value)
+        for key, seconds in self.seconds.items():
+            self.client.log_metric(self.run, f"time/{key}_s", seconds)
+        if self.load is not None:
+            self.load.finish()
+        if self.learned is not None and status == "FINISHED":
+            self._material(self.learned, scores)
         self.client.set_terminated(self.run, status)
+
+    def _material(self, filed: Filed, scores: dict[str, float]) -> None:
+        """The learned material as a logged model: `search_logged_models` and the tab Models of the page order them."""
+        from mlflow.entities import LoggedModelOutput
+
+        told = self.client.get_run(self.run).data
+        step = filed.step
+        made = self.client.create_logged_model(
+            self.experiment,
+            name=re.sub(r"[/:.%\"']", " ", self.name)[:200],
+            source_run_id=self.run,
+            tags={k: v for k, v in told.tags.items() if not k.startswith(("mlflow.", "cache/", "process"))}
+            | {"key": step.fingerprint, "artifact": os.path.relpath(step.folder, self.output)},
+            params={k: v for k, v in told.params.items() if k.startswith(("material.", "world.", "learn."))},
+            model_type="material",
+        )
+        for name in ("fields.json", "arrays.safetensors"):  # physics3d.artifact reads them
+            if (step.folder / name).is_file():
+                self.client.log_model_artifact(made.model_id, str(step.folder / name))
+        for key, value in scores.items():
+            if key.startswith(("learned/", "score/learned/")):
+                self.client.log_metric(self.run, _name(key), value, model_id=made.model_id)
+        self.client.finalize_logged_model(made.model_id, "READY")
+        self.client.log_outputs(self.run, [LoggedModelOutput(made.model_id, step=0)])
 
 
 def flatten(config: Any, prefix: str = "") -> dict[str, Any]:
@@ -171,7 +229,8 @@ def _is_record(file: Path) -> bool:
 def _move(record: sqlite3.Connection, experiment: int, old: str, new: str) -> None:
     if old == new:
         return
-    for table, column in (("experiments", "artifact_location"), ("runs", "artifact_uri")):
+    places = (("experiments", "artifact_location"), ("runs", "artifact_uri"), ("logged_models", "artifact_location"))
+    for table, column in places:
         change = f"update {table} set {column} = ? || substr({column}, ?) "
         change += f"where experiment_id = ? and substr({column}, 1, ?) = ?"
         record.execute(change, (new, len(old) + 1, experiment, len(old), old))
@@ -249,7 +308,9 @@ def _warn(error: Exception) -> None:
 
 
 def git_commit(root: Path) -> str:
-    """Commit of the working tree, with + if it differs, "none" outside git."""
+    """Commit of the working tree, with + if it differs, "none" outside git, or where the package is installed."""
+    if not (root / ".git").exists():
+        return "none"
     call = ["git", "-C", str(root), "describe", "--always", "--abbrev=10", "--dirty=+"]
     try:
         return subprocess.run(call, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
@@ -273,18 +334,23 @@ def labels(output: Path) -> dict[str, dict[str, str]]:
     return found
 
 
-def address(output: Path, port: int = 5000) -> str:
-    """The page that compares runs, once `serve` runs."""
+def address(output: Path, port: int = 5000, sweep: str = "") -> str:
+    """The page that compares runs, or those of a sweep, once `serve` runs."""
     with closing(_connect(output.resolve() / "mlflow.db", "ro")) as record:
         query = "select experiment_id from experiments where name = ?"
         (experiment,) = record.execute(query, (EXPERIMENT,)).fetchone()
-    return f"http://127.0.0.1:{port}/#/experiments/{experiment}/runs?compareRunsMode=CHART"
+    return f"http://127.0.0.1:{port}/#/experiments/{experiment}/runs?compareRunsMode=CHART{_filter(sweep)}"
+
+
+def _filter(sweep: str) -> str:
+    only = f"tags.sweep = '{sweep}'"
+    return f"&searchFilter={quote(only)}" if sweep else ""
 
 
 def serve(output: Path, port: str) -> int:
     """Print the address and serve it until Ctrl-C."""
     try:
-        number = _free(port)
+        number = free_port(port)
         mend(output)
         print(f"open {address(output, number)}\n(up in about 15 s; Ctrl-C ends it)", flush=True)
         options = ["--backend-store-uri", database(output), "--host", "127.0.0.1", "--port", str(number)]
@@ -307,9 +373,9 @@ def serve(output: Path, port: str) -> int:
             return 0
 
 
-def _free(port: str) -> int:
+def free_port(port: str, command: str = "make ui") -> int:
     """The number of a port that can be served. Raises ValueError with the remedy."""
-    remedy = "make ui PORT=<a number from 1024 to 65535>"
+    remedy = f"{command} PORT=<a number from 1024 to 65535>"
     if not re.fullmatch("[0-9]{1,5}", port) or not 0 < int(port) < 65536:
         raise ValueError(f"PORT={port} is no port; {remedy}")
     with socket.socket() as probe:
@@ -317,7 +383,7 @@ def _free(port: str) -> int:
         try:
             probe.bind(("127.0.0.1", int(port)))
         except OSError as error:
-            taken = f"port {port} cannot be served ({error.strerror}); is `make ui` running elsewhere?"
+            taken = f"port {port} cannot be served ({error.strerror}); is `{command}` running elsewhere?"
             raise ValueError(f"{taken} {remedy}") from error
     return int(port)
 
@@ -327,5 +393,9 @@ def _name(text: str) -> str:
     return re.sub(r"[^\w\-. /]", "_", text)
 
 
+def main(words: list[str]) -> int:
+    return serve(Path(words[0] if words else "."), os.environ.get("PORT") or "5000")
+
+
 if __name__ == "__main__":
-    sys.exit(serve(Path(sys.argv[1] if len(sys.argv) > 1 else "."), os.environ.get("PORT") or "5000"))
+    sys.exit(main(sys.argv[1:]))

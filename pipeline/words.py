@@ -1,7 +1,8 @@
 """Words of the command line that are not Hydra's: paths, taken as they stand, and what `make` was given as ARGS.
 
 Hydra reads a value as an expression, in which spaces, parentheses, commas, quotes and $ have a meaning. A path may hold
-any of them, so the values of `data`, `output` and every entry called path are quoted before Hydra sees them.
+any of them, so the values of `data`, `output` and every entry called path are quoted before Hydra sees them. So are
+fingerprints, which may look like numbers.
 
     python -m pipeline.words <options of Python ...>     runs Python with these and the words of ARGS, through no shell
 """
@@ -35,7 +36,7 @@ def _literal(word: str) -> str:
 def _is_path(key: str, value: str) -> bool:
     if key in ("data", "output"):
         return True
-    named = key.lstrip("+").split(".")[-1].split("_")[-1] == "path"
+    named = key.lstrip("+").split(".")[-1].split("_")[-1] == "path" or key.startswith("use.")
     return named and value != "null" and not value.startswith("${")  # nothing, or what another entry says
 
 

@@ -23,6 +23,13 @@ BLOCKED = (
     "open3d",
     "pycolmap",
     "gsplat",
+    "fastapi",
+    "torchvision",
+    "viser",
+    "pxr",
+    "dask",
+    "distributed",
+    "prefect_dask",
 )
 SCRIPT = f"""
 import importlib, pkgutil, sys
@@ -35,6 +42,9 @@ class Absent(MetaPathFinder):
 
 sys.meta_path.insert(0, Absent())
 import physics3d, stages
+assert not {{"torch", "warp", "numpy"}} & set(sys.modules), "importing the package alone costs nothing"
+for name in physics3d.__all__:
+    getattr(physics3d, name)
 
 for package in (physics3d, stages):
     for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):

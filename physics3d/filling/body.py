@@ -13,6 +13,8 @@ from physics3d.matter import Matter
 
 @dataclass(frozen=True, kw_only=True)
 class Body(AbstractArtifact):
+    """p particles that fill the thing that moves, and the Gaussians that ride on them."""
+
     position: Float[Tensor, "p 3"]  # at rest [m]
     volume: Float[Tensor, " p"]  # [m^3]
     part: Int[Tensor, " p"]  # int32, 0-based index into the segmentation's parts

@@ -11,6 +11,8 @@ from torch import Tensor
 
 @dataclass(frozen=True, kw_only=True)
 class Camera:
+    """A pinhole camera without distortion."""
+
     width: int  # [px]
     height: int  # [px]
     fx: float  # focal length [px]

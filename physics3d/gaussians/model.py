@@ -15,6 +15,8 @@ from physics3d.artifact import AbstractArtifact, require_finite
 
 @dataclass(frozen=True, kw_only=True)
 class Gaussians(AbstractArtifact):
+    """A model of n 3D Gaussians, as it is stored and optimised. Lengths in metres."""
+
     mean: Float[Tensor, "n 3"]  # [m]
     log_scale: Float[Tensor, "n 3"]  # ln of the standard deviations [ln m]
     quaternion: Float[Tensor, "n 4"]  # w, x, y, z; need not be normalised

@@ -11,6 +11,8 @@ from physics3d.gaussians.cameras import Camera
 
 @dataclass(frozen=True, kw_only=True)
 class Photograph:
+    """What a model is fitted to: colours, their camera, and a matte where there is one."""
+
     camera: Camera
     color: Float[Tensor, "h w 3"]  # 0..1; where there is a matte, multiplied by it
     alpha: Float[Tensor, "h w"] | None  # matte, 0..1

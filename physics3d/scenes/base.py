@@ -63,6 +63,8 @@ class Take:
 
 @dataclass(frozen=True, kw_only=True)
 class Capture(AbstractArtifact):
+    """All that is known about a scene before anything is computed. Metres, z up."""
+
     name: str
     images: tuple[Tensor, ...]  # uint8 [h, w, 3]; sizes may differ; composited on `background` where there is alpha
     cameras: tuple[Camera, ...]  # one per image

@@ -10,6 +10,8 @@ from physics3d.artifact import AbstractArtifact
 
 @dataclass(frozen=True, kw_only=True)
 class Segmentation(AbstractArtifact):
+    """Which of n Gaussians may move, and which part of the thing each belongs to."""
+
     label: Int[Tensor, " n"]  # int32 per Gaussian: 0 is static, k moves and belongs to parts[k - 1]
     parts: tuple[str, ...]
     masks: UInt8[Tensor, "v h w"] | None  # labels of pixels; smaller views are padded with 0 at the right and below

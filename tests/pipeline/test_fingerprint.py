@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from pipeline import fingerprint as module
-from pipeline.fingerprint import _imports, _reached, _tree, _tree_digest, code_digest, fingerprint, libraries
+from pipeline.fingerprint import _imports, _reached, _tree, _tree_digest, code, fingerprint, libraries
 
 STAGE = '''"""A stage."""
 from dataclasses import dataclass
@@ -41,10 +41,10 @@ def tree(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def digest(root: Path) -> str:
-    for remembered in (code_digest, libraries, _reached, _imports, _tree, _tree_digest):
+def digest(root: Path) -> dict[str, str]:
+    for remembered in (code, libraries, _reached, _imports, _tree, _tree_digest):
         remembered.cache_clear()
-    return code_digest(("stages.fill.Fill",), root)
+    return code(("stages.fill.Fill",), root)
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,10 @@ import time
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
-from pipeline.tracking import EXPERIMENT, Tracking, _free, _process, address, mend
+from pipeline.stage import Filed, Step
+from pipeline.tracking import EXPERIMENT, Tracking, _process, address, free_port, mend
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 OPEN = """
@@ -137,7 +139,7 @@ def test_a_record_in_use_is_left_in_its_place(folder, capsys, monkeypatch):
 @pytest.mark.parametrize("port", ["abc", "", "0", "70000", "-1", "5000; true", "80.5", "٣"])
 def test_what_is_no_port_is_refused(port):
     with pytest.raises(ValueError, match=r"is no port; make ui PORT="):
-        _free(port)
+        free_port(port)
 
 
 def test_a_port_that_is_taken_is_one_line(folder):
@@ -152,4 +154,80 @@ def test_a_port_that_is_taken_is_one_line(folder):
     assert done.returncode == 1 and not done.stdout
     (line,) = done.stderr.splitlines()
     assert line.startswith(f"error: port {port} cannot be served") and "make ui PORT=" in line
-    assert _free(str(port)) == port and str(port) in address(folder, port)
+    assert free_port(str(port)) == port and str(port) in address(folder, port)
+
+
+def run_of(folder: Path, modulus: float, psnr: float, hit: bool = False) -> Tracking:
+    """The record of a run whose steps are a learned material and a film of it."""
+    steps = []
+    learned = ["fields.json", "previews/parameters.png", "previews/loss_00003.png"]
+    for name, files in (("learn", learned), ("render", ["a.mp4"])):
+        step = Step(name, name, {}, (), folder / "artifacts", f"{modulus:g}")
+        for file in files:
+            (step.folder / file).parent.mkdir(parents=True, exist_ok=True)
+            if file.endswith("png"):
+                Image.new("RGB", (4, 4)).save(step.folder / file)
+            else:
+                (step.folder / file).write_text("x")
+        steps.append(Filed(step, hit, {"seconds": 3.0, "peak_rss_bytes": 1}))
+    made = Tracking(folder, config={"seed": 1}, name="ball physics3d seed 1 learn.steps=2", tags={"scene": "ball"})
+    for filed in steps:
+        made.stage(filed)
+    scores = {"learned/youngs_modulus": modulus, "score/learned/psnr": psnr, "score/initial/psnr": 9.0}
+    made.close(scores=scores, status="FINISHED")
+    assert not made.broken
+    return made
+
+
+def test_materials_of_all_runs_can_be_put_in_an_order_also_after_a_move(folder, tmp_path_factory):
+    from mlflow.tracking import MlflowClient
+
+    for modulus, psnr in ((1e5, 20.0), (3e5, 30.0), (2e5, 25.0)):
+        run_of(folder, modulus, psnr)
+    moved = tmp_path_factory.mktemp("elsewhere") / "moved"
+    shutil.move(folder, moved)
+    mend(moved)
+    client = MlflowClient(f"sqlite:///{moved / 'mlflow.db'}")
+    (experiment,) = [e for e in client.search_experiments() if e.name == EXPERIMENT]
+    order = [{"field_name": "metrics.score/learned/psnr", "ascending": False}]
+    best, *rest = client.search_logged_models([experiment.experiment_id], order_by=order)
+    assert {m.key: m.value for m in best.metrics} == {"learned/youngs_modulus": 3e5, "score/learned/psnr": 30.0}
+    filed = [m.tags["artifact"] for m in (best, *rest)]
+    assert filed == ["artifacts/learn/300000", "artifacts/learn/200000", "artifacts/learn/100000"]
+    assert best.tags["scene"] == "ball" and best.artifact_location.startswith(moved.as_uri())
+    assert [p.name for p in (moved / "mlartifacts").rglob("fields.json")] == ["fields.json"] * 3
+
+
+def test_parents_say_what_was_reused_how_long_it_took_and_show_it(folder):
+    made = run_of(folder, 1e5, 20.0, hit=True)
+    run = made.client.get_run(made.run)
+    assert run.data.tags["cache/learn"] == run.data.tags["cache/render"] == "hit"
+    assert {k: v for k, v in run.data.metrics.items() if k.startswith("time/")} == {
+        "time/learn_s": 3.0,
+        "time/render_s": 3.0,
+        "time/all_s": 6.0,
+        "time/computed_s": 0.0,
+    }
+    attached = {f.path for place in ("videos", "plots/learn") for f in made.client.list_artifacts(made.run, place)}
+    assert attached == {"videos/a.mp4", "plots/learn/parameters.png"}  # not what belongs to a step of the learning
+
+
+def test_the_experiment_says_that_it_is_of_training_runs(folder):
+    """The word is the one that the page of the installed MLflow knows."""
+    import mlflow
+
+    made = Tracking(folder, config={}, name="x", tags={})
+    kind = made.client.get_experiment(made.experiment).tags["mlflow.experimentKind"]
+    made.close(scores={}, status="FINISHED")
+    page = Path(mlflow.__file__).parent / "server" / "js" / "build" / "static" / "js"
+    assert any(f'CUSTOM_MODEL_DEVELOPMENT="{kind}"' in file.read_text() for file in page.glob("*.js"))
+
+
+def test_the_load_of_the_machine_is_recorded_until_the_end(folder, monkeypatch):
+    monkeypatch.setenv("MLFLOW_SYSTEM_METRICS_SAMPLING_INTERVAL", "0.05")
+    made = Tracking(folder, config={}, name="x", tags={})
+    while not rows(folder, "select 1 from latest_metrics where key like 'system/%memory%'"):
+        time.sleep(0.05)
+    made.close(scores={}, status="FINISHED")
+    assert made.load._process is None or not made.load._process.is_alive()
+    assert rows(folder, "select 1 from latest_metrics where key like 'system/cpu%'")

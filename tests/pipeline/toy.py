@@ -1,5 +1,6 @@
 """Throw-away stages to test the machinery with; switches make them slow, fail, or fill the disk."""
 
+import os
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -48,7 +49,11 @@ def note(diary: str, name: str) -> None:
         return
     with Path(diary).open("a") as lines:
         lines.write(name + "\n")
-    while (Path(diary).parent / f"stop in {name}").exists():
+    place = Path(diary).parent
+    if (place / f"stop in {name}").exists():
+        with (place / f"processes in {name}").open("a") as lines:
+            lines.write(f"{os.getpid()}\n")
+    while (place / f"stop in {name}").exists():
         time.sleep(0.02)
 
 
