@@ -7,12 +7,13 @@ ARGS ?=
 REAL ?=
 PRED ?=
 OUT ?=
-PORT ?= 5000
+PORT ?=
+LISTEN ?=
 PYTHON ?= python3
 # these may hold anything, quotes, semicolons and dollar signs too: they are taken as they stand, and reach commands by the
 # environment, never as a part of a line that a shell or make reads
-$(foreach name,SCENE PROFILE METHOD DATA ARGS PORT PYTHON REAL PRED OUT,$(eval override $(name) := $$(value $(name))))
-export SCENE PROFILE METHOD DATA ARGS PORT PYTHON REAL PRED OUT
+$(foreach name,SCENE PROFILE METHOD DATA ARGS PORT LISTEN PYTHON REAL PRED OUT,$(eval override $(name) := $$(value $(name))))
+export SCENE PROFILE METHOD DATA ARGS PORT LISTEN PYTHON REAL PRED OUT
 
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
@@ -57,11 +58,8 @@ twin: $(ready) ## a thing with known material as photographs and clips on disk: 
 ui: $(ready) ## MLflow: prints the address of the page that compares runs, and serves it
 	@$(py) -m pipeline.tracking .
 
-view: ## the video and previews of the last run
-	@folder=artifacts/$$(cat artifacts/.latest 2>/dev/null || echo nowhere); \
-	test -d "$$folder" || { echo "error: nothing rendered yet; make run SCENE=$$SCENE"; exit 1; }; \
-	ls -d "$$folder"/*.mp4 "$$folder"/previews/*; \
-	if [ -n "$$DISPLAY$$WAYLAND_DISPLAY" ] && command -v xdg-open >/dev/null; then xdg-open "$$(ls "$$folder"/*.mp4 | head -1)"; fi
+view: $(ready) ## a finished run in the browser, and a poke that is simulated live: [PORT=8080] [LISTEN=127.0.0.1]
+	@$(threads) $(with_args) -m pipeline.view scene="$$SCENE" profile="$$PROFILE" method="$$METHOD" $${DATA:+data="$$DATA"}
 
 test: $(ready) ## everything that needs no GPU and no weights
 	@OMP_NUM_THREADS=1 $(with_args) -m pytest -n 2 --dist loadfile
