@@ -12,6 +12,7 @@ import re
 import signal
 import socket
 import sys
+import threading
 import webbrowser
 from collections.abc import Mapping
 from pathlib import Path
@@ -70,6 +71,7 @@ def show(config: dict[str, Any], picked: dict[str, str], environment: Mapping[st
         print(f"warning: whoever reaches {host or 'this machine'} may use the page and save scenes", flush=True)
     if environment.get("DISPLAY") or environment.get("WAYLAND_DISPLAY"):
         webbrowser.open(address)
+    threading.Thread(target=page.prepare, daemon=True).start()
     try:
         page.serve()
     finally:

@@ -5,10 +5,11 @@ nothing is asked, nothing is sent. The page says how many frames a second were c
 took: what a browser or a slow line makes of them is not known here (viser then leaves out frames that are overtaken).
 """
 
+import contextlib
 import html
+import io
 import math
 import queue
-import threading
 import time
 from collections import deque
 from collections.abc import Callable
@@ -26,6 +27,7 @@ from physics3d.view.run import Run
 RATE = 30.0  # frames a second at most
 IDLE = 0.05  # between looks at whether something is asked [s]
 HANDLES = 1500  # places to take hold of, at most
+WIDE = 320  # of the clip, at least [px]
 TURNED = 0.03  # of its distance, from which on a moved eye has new colours
 POKE = "Drag any part of the body. It is simulated as you pull; the camera turns when you drag beside it."
 
@@ -51,7 +53,8 @@ class Page:
         self.eye = eye.astype(float)
         self._drawn_from: np.ndarray | None = None  # the eye that the still background has the colours of
         self._spent: deque[tuple[float, float, float, int]] = deque(maxlen=60)
-        self.server = viser.ViserServer(host=host, port=port, label=f"Physics3D: {run.name}", verbose=False)
+        with contextlib.redirect_stdout(io.StringIO()):  # it says addresses of its own
+            self.server = viser.ViserServer(host=host, port=port, label=f"Physics3D: {run.name}", verbose=False)
         if self.server.get_port() != port:  # it takes the next one that is free
             self.server.stop()
             raise OSError(f"port {port} is taken")
@@ -107,6 +110,7 @@ class Page:
     def _panel(self) -> None:
         gui, motion = self.server.gui, self.run.trajectory
         gui.configure_theme(show_logo=False, show_share_button=False)  # sharing would leave this machine
+        gui.main_panel.dock_right()
         self._rate = gui.add_markdown("")
         with gui.add_folder("Motion"):
             self._play = gui.add_checkbox("play", True)
@@ -140,10 +144,10 @@ class Page:
         if clip is not None and self.run.take is not None:
             beside = gui.add_panel()
             with beside.add_tab("Recorded clip"):
-                self._clip = gui.add_image(clip[0].numpy(), label=f"take {self.run.take.name}, {self.run.take.role}")
+                self._clip = gui.add_image(_enlarged(clip[0].numpy()), label=f"take {self.run.take.name}, {self.run.take.role}")
                 gui.add_markdown("*As recorded, at the same time as the run.*")
             beside.dock_left()
-            beside.set_width(300)
+            beside.set_width(WIDE + 20)
 
         self._clock.on_update(lambda event: self.asked.put(("time", event.client is not None)))
         for control in (self._kind, self._balls):
@@ -174,7 +178,7 @@ class Page:
         self.asked.put(("look",))
 
     def prepare(self) -> None:
-        """Make the poke ready, and say in the page why not where it cannot be. Takes seconds; any thread."""
+        """Make the poke ready, or say in the page why it cannot be. Takes seconds, and may run beside `serve`."""
         try:
             made = Live.of(self.run.world, self.run.body, self.run.values, log=self.log)
         except ValueError as reason:
@@ -186,7 +190,6 @@ class Page:
 
     def serve(self, seconds: float = math.inf) -> None:
         """Draw until interrupted, or for so long."""
-        threading.Thread(target=self.prepare, daemon=True).start()
         begun = last = time.perf_counter()
         while (now := time.perf_counter()) - begun < seconds:
             drawn = self.turn(now - last)
@@ -273,7 +276,7 @@ class Page:
             return
         frame = min(int(self.time * take.fps + 1e-6), len(clip) - 1)
         if frame != self._frame_of_clip:
-            self._frame_of_clip, self._clip.image = frame, clip[frame].numpy()
+            self._frame_of_clip, self._clip.image = frame, _enlarged(clip[frame].numpy())
 
     def _obey(self, what: str, *told: Any) -> None:
         self.stale = True
@@ -388,6 +391,12 @@ class Page:
 
 def _send(node: Any, splats: Splats) -> None:
     node.set_gaussians(splats.centers, splats.covariances, splats.rgbs, splats.opacities)
+
+
+def _enlarged(picture: np.ndarray) -> np.ndarray:
+    """Whole pixels of a small picture, for a panel that does not stretch it."""
+    times = max(1, round(WIDE / picture.shape[1]))
+    return picture.repeat(times, 0).repeat(times, 1)
 
 
 def _css(color: np.ndarray) -> str:

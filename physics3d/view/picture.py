@@ -96,10 +96,10 @@ class Pictures:
         """What moves, seen from `eye` [m]."""
         mean, upper, turn = self.riders.carry(moment.position, moment.deformation)
         if kind == "picture":
-            way = mean - eye
-            if turn is not None:
-                way = np.stack([sum(turn[j, i] * way[:, j] for j in range(3)) for i in range(3)], 1)
-            rgbs = _bytes(sh_color(self.moving.sh, torch.from_numpy(way).to(self.moving.sh)))
+            way = (mean - eye).astype(np.float32)
+            if turn is not None:  # back to where the Gaussian was at rest
+                way = np.einsum("jig,gj->gi", turn, way)
+            rgbs = _bytes(sh_color(self.moving.sh, torch.from_numpy(way)))
         elif kind == "part":
             rgbs = colors.of_parts(self._part_of_gaussians)
         else:

@@ -24,34 +24,33 @@ UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # of a symmetric matri
 
 
 class Riders:
-    """The Gaussians of an embedding and how they follow particles whose place at rest is X [p, 3] m."""
+    """The Gaussians of an embedding and how they follow particles whose place at rest is X [p, 3] m; in float32."""
 
     def __init__(self, gaussians: Gaussians, embedding: Embedding, X: Float[Tensor, "p 3"]):
         mine = gaussians.select(embedding.which)
-        self.X = X.double().numpy()
+        self.X = X.float().numpy()
         g, k = embedding.neighbours.shape
-        rows = (embedding.weights.double().numpy().ravel(), embedding.neighbours.numpy().ravel(), np.arange(g + 1) * k)
+        rows = (embedding.weights.float().numpy().ravel(), embedding.neighbours.numpy().ravel(), np.arange(g + 1) * k)
         self.weights = sparse.csr_matrix(rows, shape=(g, len(X)))
-        lever = mine.mean.double().numpy() - 0.5 * (self.weights @ self.X)
-        self._lever = lever.T.copy()  # [3, g]
+        self._lever = (mine.mean.float().numpy() - 0.5 * (self.weights @ self.X)).T.copy()  # [3, g]
         # Sigma = L L^T at rest
         root = mine.rotation() * mine.log_scale.exp()[:, None, :]
-        self._root = root.permute(1, 2, 0).contiguous().double().numpy()  # [3, 3, g]
+        self._root = root.permute(1, 2, 0).contiguous().float().numpy()  # [3, 3, g]
         self.turns = gaussians.sh.shape[1] > 1
 
     def carry(
         self, x: Float[Tensor, "p 3"], F: Float[Tensor, "p 3 3"]
     ) -> tuple[Float[np.ndarray, "g 3"], Float[np.ndarray, "g 6"], Float[np.ndarray, "3 3 g"] | None]:
         """Means [m], upper triangles of the covariances [m^2] and rotations, None where no colour needs them."""
-        x_, F_ = x.double().numpy(), F.double().numpy()
-        carried = np.empty((len(x_), 12))
+        x_, F_ = x.float().numpy(), F.float().numpy()
+        carried = np.empty((len(x_), 12), np.float32)
         carried[:, :9] = F_.reshape(-1, 9)
         carried[:, 9:] = x_ - 0.5 * np.einsum("pij,pj->pi", F_, self.X)
         blended = np.ascontiguousarray((self.weights @ carried).T)  # [12, g]
-        G, lever, L = blended[:9].reshape(3, 3, -1), self._lever, self._root
-        mean = blended[9:] + np.stack([sum(G[i, j] * lever[j] for j in range(3)) for i in range(3)])
-        M = [[sum(G[i, k] * L[k, j] for k in range(3)) for j in range(3)] for i in range(3)]
-        upper = np.stack([sum(M[i][k] * M[j][k] for k in range(3)) for i, j in UPPER], 1)
+        G = blended[:9].reshape(3, 3, -1)
+        mean = blended[9:] + np.einsum("ijg,jg->ig", G, self._lever)
+        M = np.einsum("ikg,kjg->ijg", G, self._root)
+        upper = np.stack([(M[i] * M[j]).sum(0) for i, j in UPPER], 1)
         return mean.T, upper, rotation(G) if self.turns else None
 
     def blend(self, value: Float[np.ndarray, " p"]) -> Float[np.ndarray, " g"]:
@@ -61,12 +60,11 @@ class Riders:
 
 def rotation(F: Float[np.ndarray, "3 3 g"]) -> Float[np.ndarray, "3 3 g"]:
     """R of F = R S; the identity where F turns inside out or has lost its volume."""
-    cofactor, det = _cofactor(F)
-    sound = det > FLAT
-    R = np.where(sound, F, np.eye(3)[:, :, None])
+    sound = (F[0] * _cofactor(F)[0]).sum(0) > FLAT
+    R = np.where(sound, F, np.eye(3, dtype=F.dtype)[:, :, None])
     for _ in range(ITERATIONS):
-        cofactor, det = _cofactor(R)
-        new = 0.5 * (R + cofactor / det)  # R^-T is the matrix of cofactors over the determinant
+        cofactor = _cofactor(R)
+        new = 0.5 * (R + cofactor / (R[0] * cofactor[0]).sum(0))  # R^-T: the cofactors over the determinant
         change = np.abs(new - R).max(initial=0)
         R = new
         if change < EVEN:
@@ -74,6 +72,10 @@ def rotation(F: Float[np.ndarray, "3 3 g"]) -> Float[np.ndarray, "3 3 g"]:
     return R
 
 
-def _cofactor(A: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    C = np.stack([np.cross(A[(i + 1) % 3], A[(i + 2) % 3], axis=0) for i in range(3)])
-    return C, (A[0] * C[0]).sum(0)
+def _cofactor(A: Float[np.ndarray, "3 3 g"]) -> Float[np.ndarray, "3 3 g"]:
+    C = np.empty_like(A)
+    for i in range(3):
+        p, q = A[(i + 1) % 3], A[(i + 2) % 3]
+        for j in range(3):
+            C[i, j] = p[(j + 1) % 3] * q[(j + 2) % 3] - p[(j + 2) % 3] * q[(j + 1) % 3]
+    return C

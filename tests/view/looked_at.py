@@ -1,4 +1,4 @@
-"""A run that the page shows: the bar of `small_scene`, poked, with a moving rod's worth of Gaussians that see colours."""
+"""A run that the page shows: the bar of `small_scene`, poked and filmed, its colours those of a direction."""
 
 import torch
 from small_scene import DAMPED, DX, POKE, bar, cameras, world
