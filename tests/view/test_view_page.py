@@ -8,8 +8,7 @@ import urllib.request
 
 import numpy as np
 import pytest
-import viser.transforms
-from browser import chromium, opened
+from browser import chromium, opened, place_of
 from looked_at import run
 
 from physics3d.log import Log
@@ -63,19 +62,6 @@ def test_a_taken_port_is_refused(page):
         Page(page.run, host="127.0.0.1", port=page.server.get_port(), save=lambda i, n: "", log=Log(None))
 
 
-def on_screen(page: Page, tab, point: np.ndarray) -> tuple[float, float]:
-    """Where a point [m] is in the window [px], by the camera that the browser says it has."""
-    (client,) = page.server.get_clients().values()
-    camera = client.camera
-    x, y, w, h = tab.evaluate(
-        "[...document.querySelectorAll('canvas')].map(c => c.getBoundingClientRect())"
-        ".sort((a, b) => b.width * b.height - a.width * a.height).map(r => [r.x, r.y, r.width, r.height])[0]"
-    )
-    local = viser.transforms.SO3(camera.wxyz).as_matrix().T @ (point * page.pictures.scale - camera.position)
-    focal = h / 2 / np.tan(camera.fov / 2)
-    return x + w / 2 + focal * local[0] / local[2], y + h / 2 + focal * local[1] / local[2]
-
-
 @pytest.mark.skipif(chromium() is None, reason="no chromium; on Debian: apt install chromium")
 def test_a_body_that_is_dragged_in_a_browser_follows_and_the_poke_is_kept(page, tmp_path):
     """Pressed at its top, drawn to the right and held there: it bends to the right, on the page and in numbers."""
@@ -87,11 +73,11 @@ def test_a_body_that_is_dragged_in_a_browser_follows_and_the_poke_is_kept(page, 
         page.time, page.stale = 0.0, True
         tab.wait_for("still")
         at = np.array([0.0, -0.05, 0.37])
-        u, v = on_screen(page, tab, at)
+        u, v = place_of(page, tab, at)
         before = tab.picture()
         tab.mouse("mouseMoved", u, v, pressed=False)
         tab.mouse("mousePressed", u, v)
-        to, _ = on_screen(page, tab, at + np.array([0.06, 0.0, 0.0]))
+        to, _ = place_of(page, tab, at + np.array([0.06, 0.0, 0.0]))
         for share in (0.2, 0.4, 0.6, 0.8, 1.0):
             tab.mouse("mouseMoved", u + share * (to - u), v)
             time.sleep(0.1)

@@ -11,6 +11,7 @@ import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -51,6 +52,12 @@ class Tab:
             assert time.monotonic() < end, f"{what!r} does not appear; there is {self.text()!r}"
             time.sleep(0.2)
 
+    def close_notes(self) -> None:
+        """Close what the page says of itself in a corner, e.g. that no GPU draws it."""
+        time.sleep(1.0)
+        self.evaluate("document.querySelectorAll('.mantine-Notification-closeButton').forEach(b => b.click())")
+        time.sleep(1.0)
+
     def picture(self) -> np.ndarray:
         """[h, w, 3] uint8."""
         from PIL import Image
@@ -69,6 +76,22 @@ class Tab:
             buttons=int(pressed),
             clickCount=int(pressed),
         )
+
+
+def place_of(page: Any, tab: Tab, point: np.ndarray) -> tuple[float, float]:
+    """Where a point of the body [m] is in the window [px], by the camera that the browser says it has. `page` is the
+    one of `physics3d.view`."""
+    import viser.transforms
+
+    (client,) = page.server.get_clients().values()
+    camera = client.camera
+    x, y, w, h = tab.evaluate(
+        "[...document.querySelectorAll('canvas')].map(c => c.getBoundingClientRect())"
+        ".sort((a, b) => b.width * b.height - a.width * a.height).map(r => [r.x, r.y, r.width, r.height])[0]"
+    )
+    local = viser.transforms.SO3(camera.wxyz).as_matrix().T @ (point * page.pictures.scale - camera.position)
+    focal = h / 2 / np.tan(camera.fov / 2)
+    return x + w / 2 + focal * local[0] / local[2], y + h / 2 + focal * local[1] / local[2]
 
 
 @contextmanager
