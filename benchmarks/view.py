@@ -4,8 +4,8 @@
     make bench-view [ARGS="scene=carnation profile=smoke"]     ->   docs/results/view.md, view.png
 
 The Gaussians of the run are repeated until COUNT of them move; a hand pulls at the middle of the upper half. Frames are
-counted where they arrive, by a client of the page's own protocol on this machine that draws nothing: simulation, colours,
-packing and sending share two cores with it. The picture is Chromium's, with the run's own Gaussians, if there is one.
+counted where they arrive, by a client of the page's own protocol on this machine that draws nothing: simulation,
+colours, packing and sending share the cores with it. The picture is Chromium's, of the run's own Gaussians.
 """
 
 import sys
@@ -42,15 +42,15 @@ def main(words: list[str]) -> None:
     lines = [
         "# The page of make view: frames a second",
         "",
-        f"`make bench-view`: {run.name}, {len(run.body.position)} particles, {COUNT} moving Gaussians (its own, repeated), "
-        f"{SECONDS:g} s each. {machine('cpu')}.",
+        f"`make bench-view`: {run.name}, {len(run.body.position)} particles, {COUNT} moving Gaussians (its own, "
+        f"repeated), {SECONDS:g} s each. {machine('cpu')}.",
         "",
-        "| what moves | frames/s that arrive | motion [ms] | drawing [ms] | MB a frame | seconds simulated per second |",
+        "| what moves | frames/s that arrive | motion [ms] | drawing [ms] | MB a frame | simulated s per s |",
         "|---|---|---|---|---|---|",
         *(f"| {' | '.join(row)} |" for row in rows),
         "",
-        "Frames are counted where they arrive, by a client that draws nothing. What a browser draws of them depends on its",
-        "graphics; over a slow line, frames that are overtaken are left out.",
+        "Frames are counted where they arrive, by a client that draws nothing. What a browser draws of them depends on",
+        "its graphics; over a slow line, frames that are overtaken are left out.",
     ]
     (RESULTS / "view.md").write_text("\n".join(lines) + "\n")
     print("\n".join(lines))
