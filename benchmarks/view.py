@@ -101,7 +101,7 @@ def measure(run: Run) -> list[tuple[str, ...]]:
                 ("a live pull, as a picture", "picture", True),
                 ("a live pull, by stress", "stress", True),
             ):
-                page._kind.value = kind
+                page.kind.value = kind
                 if live and page.live is not None:
                     page.mode = "live"
                     page.live.grab(upper(run))

@@ -31,6 +31,7 @@ FOLLOWED = 3  # modes
 STEPS = 16  # in a period of the last of them: the midpoint rule is then late by a hundredth of a period in each
 LONGEST, SHORTEST = 1 / 60, 1 / 480  # [s] of a step
 MOST = 0.1  # of the clock that one call makes up for [s]
+STILL = 1e-4  # of its size per second: who moves less for a second has come to rest
 
 
 @dataclass
@@ -52,6 +53,8 @@ class Live:
         self.record: Record | None = None
         self.trouble = ""  # what a person should know, in one line
         self.late = 0.0  # of the clock [s]
+        self.quiet = 0.0  # for how long it has not moved [s]
+        self._size = float((body.position.amax(0) - body.position.amin(0)).max())
         self.stress = self._unstressed()
 
     @classmethod
@@ -88,7 +91,7 @@ class Live:
         if not hold.compliance > 0:
             self.trouble = "this place is held and cannot be pulled; take another"
             return
-        self.trouble = ""
+        self.trouble, self.quiet = "", 0.0
         self.record = Record(centre=centre, radius=radius, dt=self.stepper.dt)
         self.hold = hold
 
@@ -109,7 +112,7 @@ class Live:
         """Another factor of every modulus, and another rate of decay [1/s]."""
         if (stiffness, damping) != (self.stiffness, self.damping):
             self.stiffness, self.damping = stiffness, damping
-            parameters = scaled(self.parameters, stiffness)
+            parameters, self.quiet = scaled(self.parameters, stiffness), 0.0
             self.stepper.change(parameters, damping=damping)
             self.stress.change(parameters)
 
@@ -118,15 +121,17 @@ class Live:
         before = self.stepper
         self.stepper = Stepper(before.solver, self.parameters, dt=before.dt)
         self.stepper.change(scaled(self.parameters, self.stiffness), damping=self.damping)
-        self.hold, self.late = None, 0.0
+        self.hold, self.late, self.quiet = None, 0.0, 0.0
         self.stress = self._unstressed()
 
     def _unstressed(self) -> Stress:
         return Stress(self.world.material, scaled(self.parameters, self.stiffness), len(self.body.position))
 
     def advance(self, seconds: float) -> float:
-        """Onwards by what the clock says, in whole steps; how much that was [s]. A pull that is too much for the solver
-        ends, and the body is put to rest."""
+        """Onwards by what the clock says, in whole steps; how much that was [s]: nothing once the body has come to rest.
+        A pull that is too much for the solver ends, and the body is put to rest."""
+        if self.quiet > 1 and self.hold is None:
+            return 0.0
         self.late = min(self.late + seconds, MOST)
         dt, hold = self.stepper.dt, self.hold
         count = int(self.late / dt + 1e-9)
@@ -141,6 +146,8 @@ class Live:
             if hold is not None and self.record is not None:
                 self.record.forces.append(force)
         self.late -= count * dt
+        speed = np.abs(self.stepper.solver.model.values @ self.stepper.v).max()
+        self.quiet = self.quiet + count * dt if speed < STILL * self._size else 0.0
         return count * dt
 
     def particles(self) -> tuple[Float[Tensor, "p 3"], Float[Tensor, "p 3 3"], Float[Tensor, "p 3"]]:

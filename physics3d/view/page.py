@@ -52,6 +52,9 @@ class Page:
         eye = camera.centre.numpy() if camera is not None else middle + 3 * np.array([0.0, -1.0, 0.3])
         self.eye = eye.astype(float)
         self._drawn_from: np.ndarray | None = None  # the eye that the still background has the colours of
+        self._stressed_at = 0.0  # time of the last stress of the live body [s]
+        self._grip = np.zeros(3)  # where the hand took hold [units]
+        self._said = 0.0  # when the rate was said last [s]
         self._spent: deque[tuple[float, float, float, int]] = deque(maxlen=60)
         with contextlib.redirect_stdout(io.StringIO()):  # it says addresses of its own
             self.server = viser.ViserServer(host=host, port=port, label=f"Physics3D: {run.name}", verbose=False)
@@ -113,14 +116,14 @@ class Page:
         gui.main_panel.dock_right()
         self._rate = gui.add_markdown("")
         with gui.add_folder("Motion"):
-            self._play = gui.add_checkbox("play", True)
+            self.play = gui.add_checkbox("play", True)
             self._speed = gui.add_slider("speed", min=0.1, max=2.0, step=0.1, initial_value=1.0)
             length = max((len(motion.position) - 1) / motion.fps, 1e-3)
             self._clock = gui.add_slider("time [s]", min=0.0, max=length, step=length / 1000, initial_value=0.0)
             home = gui.add_button("camera of the clip")
         with gui.add_folder("Colours"):
             kinds = [k for k in get_args(Kind) if k != "stress" or not self.pictures.no_stress]
-            self._kind = gui.add_dropdown("coloured by", kinds, initial_value="picture")
+            self.kind = gui.add_dropdown("coloured by", kinds, initial_value="picture")
             self._balls = gui.add_checkbox("particles", False)
             self._legend = gui.add_html("")
             if self.pictures.no_stress:
@@ -144,17 +147,19 @@ class Page:
         if clip is not None and self.run.take is not None:
             beside = gui.add_panel()
             with beside.add_tab("Recorded clip"):
-                self._clip = gui.add_image(_enlarged(clip[0].numpy()), label=f"take {self.run.take.name}, {self.run.take.role}")
+                self._clip = gui.add_image(
+                    _enlarged(clip[0].numpy()), label=f"take {self.run.take.name}, {self.run.take.role}"
+                )
                 gui.add_markdown("*As recorded, at the same time as the run.*")
             beside.dock_left()
             beside.set_width(WIDE + 20)
 
-        self._clock.on_update(lambda event: self.asked.put(("time", event.client is not None)))
-        for control in (self._kind, self._balls):
+        self._clock.on_update(lambda event: self.asked.put(("time",)) if event.client is not None else None)
+        for control in (self.kind, self._balls):
             control.on_update(lambda _: self.asked.put(("look",)))
         for control in (self._stiffness, self._damping):
             control.on_update(lambda _: self.asked.put(("material",)))
-        self._play.on_update(lambda event: self.asked.put(("play",)))
+        self.play.on_update(lambda event: self.asked.put(("play",)))
         self._rest.on_click(lambda _: self.asked.put(("rest",)))
         self._back.on_click(lambda _: self.asked.put(("back",)))
         self._save.on_click(lambda _: self.asked.put(("save",)))
@@ -218,10 +223,10 @@ class Page:
 
     def _move(self, elapsed: float) -> bool:
         if self.mode == "live" and self.live is not None:
-            if not self._play.value and self.live.hold is None:
+            if not self.play.value and self.live.hold is None:
                 return False
             return self.live.advance(elapsed * self._speed.value) > 0
-        if not self._play.value:
+        if not self.play.value:
             return False
         motion = self.run.trajectory
         self.time = (self.time + elapsed * self._speed.value) % (len(motion.position) / motion.fps)
@@ -237,11 +242,9 @@ class Page:
             return Moment(position=x, deformation=F, speed=np.linalg.norm(v.numpy(), axis=1), stress=stress)
         return self.pictures.moment(min(int(self.time * motion.fps + 1e-6), len(motion.position) - 1))
 
-    _stressed_at = 0.0  # time of the last stress [s]
-
     def _draw(self) -> int:
         """Send the present moment; how much that was [byte]."""
-        now, kind, scale = self.moment(), self._kind.value, self.pictures.scale
+        now, kind, scale = self.moment(), self.kind.value, self.pictures.scale
         eye = self.eye
         with self.server.atomic():
             shown = self.pictures.particles(now, kind) if self._balls.value else self.pictures.gaussians(now, kind, eye)
@@ -282,8 +285,7 @@ class Page:
         self.stale = True
         live = self.live
         if what == "time":
-            if told[0]:
-                self.mode, self.time, self._play.value = "run", float(self._clock.value), False
+            self.mode, self.time, self.play.value = "run", float(self._clock.value), False
         elif what == "eye":
             self.stale = self._sees_otherwise(told[0])
         elif what == "poke":
@@ -303,29 +305,27 @@ class Page:
             live.rest()
             self._stressed_at, self.mode = 0.0, "live"
         elif what == "back":
-            self.mode, self._play.value, self._told.content = "run", True, POKE
+            self.mode, self.play.value, self._told.content = "run", True, POKE
         elif what == "save":
             self._keep(live)
 
     def _sees_otherwise(self, eye: np.ndarray) -> bool:
         """Whether colours change with the eye."""
         self.eye = eye
-        return self._kind.value == "picture" and self.run.gaussians.sh.shape[1] > 1
+        return self.kind.value == "picture" and self.run.gaussians.sh.shape[1] > 1
 
     def _drag(self, live: Live, phase: str, which: int | None, start: np.ndarray, end: np.ndarray) -> None:
         if phase == "start" and which is not None:
             if self.mode == "run":
                 live.rest()
                 self._stressed_at, self.mode = 0.0, "live"
-            self._play.value = True
+            self.play.value = True
             self._grip = start
             live.grab(int(self._held_by[which]))
         if live.hold is not None and phase != "end":
             live.pull((end - self._grip) / self.pictures.scale)
         if phase == "end":
             live.let_go()
-
-    _grip = np.zeros(3)  # where the hand took hold [units]
 
     def _keep(self, live: Live) -> None:
         notes = ()
@@ -369,8 +369,6 @@ class Page:
             return 0.0, 0.0, 0.0, 0
         motion, drawing = (1e3 * float(np.mean([s[k] for s in spent])) for k in (1, 2))
         return (len(spent) - 1) / (spent[-1][0] - spent[0][0]), motion, drawing, spent[-1][3]
-
-    _said = 0.0  # when the rate was said last [s]
 
     def _say_rate(self, moving: bool) -> None:
         now = time.perf_counter()

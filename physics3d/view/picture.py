@@ -65,8 +65,7 @@ class Pictures:
         self.still = gaussians.select(mask)  # may be none
         self._part = body.part.long().numpy()
         self._part_of_gaussians = self._part[body.embedding.neighbours[:, 0].numpy()]
-        nearest = cKDTree(self.moving.mean.double().numpy()).query(X)[1] if len(self.moving) else np.zeros(0, int)
-        self._nearest = torch.from_numpy(nearest)
+        self._nearest = torch.from_numpy(cKDTree(self.moving.mean.double().numpy()).query(X)[1])
         self._opacity = self.moving.opacity.numpy()[:, None].astype(np.float32)
         self.speeds = speeds(motion)
         self.stiffness = stiffness(run.world.material, run.values, len(X))

@@ -131,3 +131,13 @@ def test_stiffness_multiplies_every_stress(material, rng):
     one, three = (Stress(material, v, 5).after(F, 0.01) for v in (values, scaled(values, 3.0)))
     np.testing.assert_allclose(three, 3 * one, rtol=1e-9)  # round-off
     assert (one > 0).all()
+
+
+def test_a_body_that_has_come_to_rest_costs_nothing_until_it_is_touched(made):
+    made.rest()
+    made.change(stiffness=1.0, damping=0.0)
+    passed = [made.advance(0.05) for _ in range(40)]
+    assert passed[0] > 0 and sum(passed) < 1.2 and passed[-1] == 0
+    made.grab(TOP)
+    assert made.advance(0.05) > 0
+    made.let_go()

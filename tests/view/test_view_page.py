@@ -69,7 +69,7 @@ def test_a_body_that_is_dragged_in_a_browser_follows_and_the_poke_is_kept(page, 
         tab.wait_for("frames/s")
         tab.wait_for("Drag any part")
         tab.wait_for("Recorded clip")
-        page._play.value = False
+        page.play.value = False
         page.time, page.stale = 0.0, True
         tab.wait_for("still")
         at = np.array([0.0, -0.05, 0.37])
