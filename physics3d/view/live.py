@@ -128,7 +128,7 @@ class Live:
         return Stress(self.world.material, scaled(self.parameters, self.stiffness), len(self.body.position))
 
     def advance(self, seconds: float) -> float:
-        """Onwards by what the clock says, in whole steps; how much that was [s]: nothing once the body has come to rest.
+        """Onwards by what the clock says, in whole steps; how much that was [s]: none once the body has come to rest.
         A pull that is too much for the solver ends, and the body is put to rest."""
         if self.quiet > 1 and self.hold is None:
             return 0.0

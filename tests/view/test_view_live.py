@@ -12,7 +12,6 @@ from physics3d.boundaries.half_space import HalfSpace
 from physics3d.log import Log
 from physics3d.materials.von_mises import VonMises
 from physics3d.view.live import Live, scaled
-from physics3d.view.quantities import Stress
 from physics3d.world import World
 
 LOOKED = run(frames=2)
@@ -33,11 +32,11 @@ def test_held_for_long_the_body_follows_the_hand(made):
     """The relaxed branch gives way further than the stiffness that the force is measured by: between 1 and
     (E + E_N)/E of the way, and all of it where the branch does not relax."""
     made.rest()
-    made.change(stiffness=1.0, damping=30.0)
+    made.change(stiffness=1.0, damping=18.0)  # critical for the first mode, of 1.4 Hz: its rest is e^-11 after 1.5 s
     made.grab(TOP)
     way = np.array([0.004, 0.0, 0.0])
     made.pull(way)
-    for _ in range(60):
+    for _ in range(15):
         made.advance(0.1)
     share = made.hold.share
     moved = share @ made.stepper.q
@@ -46,7 +45,7 @@ def test_held_for_long_the_body_follows_the_hand(made):
     # the fingertip is wide, so that some of the way is lost in the softest direction
     assert 0.98 * way[0] < moved[0] < 1.02 * softer * way[0]
     made.let_go()
-    for _ in range(60):
+    for _ in range(15):
         made.advance(0.1)
     assert np.abs(made.stepper.particles()[0] - LOOKED.body.position).max() < 0.02 * way[0]  # it comes back
 
@@ -124,13 +123,16 @@ def test_where_there_can_be_no_poke_the_reason_is_told(changes, reason):
 
 
 @pytest.mark.parametrize("material", RECOVERING, ids=str)
-def test_stiffness_multiplies_every_stress(material, rng):
-    """Stresses are linear in the moduli, and nothing else of a material is one."""
+def test_stiffness_multiplies_every_energy(material, rng):
+    """Energies are linear in the moduli, and nothing else of a material is one; stuck branches as well."""
     values = {name: torch.tensor(value, dtype=torch.float64) for name, value in material.example.items()}
-    F = torch.from_numpy(np.eye(3) + 0.1 * rng.normal(size=(5, 3, 3)))
-    one, three = (Stress(material, v, 5).after(F, 0.01) for v in (values, scaled(values, 3.0)))
-    np.testing.assert_allclose(three, 3 * one, rtol=1e-9)  # round-off
-    assert (one > 0).all()
+    H = torch.from_numpy(0.1 * rng.normal(size=(5, 3, 3)))
+    memory = material.initial_memory(5, torch.float64)
+    one, three = (material.coefficients(v).expand(-1, 5) for v in (values, scaled(values, 3.0)))
+    energy = material.energy(one, H, memory)
+    torch.testing.assert_close(material.energy(three, H, memory), 3 * energy, rtol=1e-9, atol=0)  # round-off
+    torch.testing.assert_close(material.wave_modulus(three), 3 * material.wave_modulus(one), rtol=1e-9, atol=0)
+    assert (energy > 0).all()
 
 
 def test_a_body_that_has_come_to_rest_costs_nothing_until_it_is_touched(made):
