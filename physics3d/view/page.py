@@ -148,7 +148,7 @@ class Page:
             beside = gui.add_panel()
             with beside.add_tab("Recorded clip"):
                 self._clip = gui.add_image(
-                    _enlarged(clip[0].numpy()), label=f"take {self.run.take.name}, {self.run.take.role}"
+                    _enlarged(clip[0].numpy()), label=f"take {self.run.take.name}"
                 )
                 gui.add_markdown("*As recorded, at the same time as the run.*")
             beside.dock_left()
