@@ -110,7 +110,7 @@ def measure(run: Run) -> list[tuple[str, ...]]:
                 before, simulated, begun = client.frames, time_of(page), time.perf_counter()
                 time.sleep(SECONDS)
                 took = time.perf_counter() - begun
-                _, motion, drawing, size = page.rate()
+                _, motion, drawing, _, size = page.rate()
                 passed = f"{(time_of(page) - simulated) / took:.2f}" if live else "-"
                 frames = (client.frames - before) / took
                 rows.append((name, f"{frames:.1f}", f"{motion:.0f}", f"{drawing:.0f}", f"{size / 1e6:.2f}", passed))

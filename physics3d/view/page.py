@@ -21,7 +21,7 @@ from physics3d.boundaries.impulse import Impulse
 from physics3d.log import Log
 from physics3d.view import colors, handle
 from physics3d.view.live import Live
-from physics3d.view.picture import UNITS, Kind, Moment, Pictures, Splats
+from physics3d.view.picture import SIZE, UNITS, Kind, Moment, Pictures, Splats
 from physics3d.view.run import Run
 
 RATE = 30.0  # frames a second at most
@@ -29,6 +29,7 @@ IDLE = 0.05  # between looks at whether something is asked [s]
 HANDLES = 1500  # places to take hold of, at most
 WIDE = 320  # of the clip, at least [px]
 TURNED = 0.03  # of its distance, from which on a moved eye has new colours
+AHEAD = np.array([0.0, -1.0, 0.3])  # where the eye is that no camera was
 POKE = "Drag any part of the body. It is simulated as you pull; the camera turns when you drag beside it."
 
 Save = Callable[[tuple[Impulse, ...], tuple[str, ...]], str]  # (a poke, notes) -> what to tell the person
@@ -49,13 +50,13 @@ class Page:
         self.stale = True  # something is to be drawn although nothing moves
         camera = run.camera
         middle = run.body.position.double().mean(0).numpy()
-        eye = camera.centre.numpy() if camera is not None else middle + 3 * np.array([0.0, -1.0, 0.3])
+        eye = camera.centre.numpy() if camera is not None else middle + 2 * SIZE / self.pictures.scale * AHEAD
         self.eye = eye.astype(float)
-        self._drawn_from: np.ndarray | None = None  # the eye that the still background has the colours of
+        self._drawn_from: tuple[Kind, np.ndarray] | None = None  # what the still background has the colours of
         self._stressed_at = 0.0  # time of the last stress of the live body [s]
         self._grip = np.zeros(3)  # where the hand took hold [units]
         self._said = 0.0  # when the rate was said last [s]
-        self._spent: deque[tuple[float, float, float, int]] = deque(maxlen=60)
+        self._spent: deque[tuple[float, float, float, int, int]] = deque(maxlen=60)  # of frames, see `rate`
         with contextlib.redirect_stdout(io.StringIO()):  # it says addresses of its own
             self.server = viser.ViserServer(host=host, port=port, label=f"Physics3D: {run.name}", verbose=False)
         if self.server.get_port() != port:  # it takes the next one that is free
@@ -147,9 +148,7 @@ class Page:
         if clip is not None and self.run.take is not None:
             beside = gui.add_panel()
             with beside.add_tab("Recorded clip"):
-                self._clip = gui.add_image(
-                    _enlarged(clip[0].numpy()), label=f"take {self.run.take.name}"
-                )
+                self._clip = gui.add_image(_enlarged(clip[0].numpy()), label=f"take {self.run.take.name}")
                 gui.add_markdown("*As recorded, at the same time as the run.*")
             beside.dock_left()
             beside.set_width(WIDE + 20)
@@ -216,8 +215,8 @@ class Page:
             return False
         self.stale = False
         computed = time.perf_counter()
-        size = self._draw()
-        self._spent.append((begun, computed - begun, time.perf_counter() - computed, size))
+        count, size = self._draw()
+        self._spent.append((begun, computed - begun, time.perf_counter() - computed, count, size))
         self._say_rate(moved)
         return True
 
@@ -242,8 +241,8 @@ class Page:
             return Moment(position=x, deformation=F, speed=np.linalg.norm(v.numpy(), axis=1), stress=stress)
         return self.pictures.moment(min(int(self.time * motion.fps + 1e-6), len(motion.position) - 1))
 
-    def _draw(self) -> int:
-        """Send the present moment; how much that was [byte]."""
+    def _draw(self) -> tuple[int, int]:
+        """Send the present moment: so many splats that move, so many bytes."""
         now, kind, scale = self.moment(), self.kind.value, self.pictures.scale
         eye = self.eye
         with self.server.atomic():
@@ -259,18 +258,18 @@ class Page:
             self._legend.content = self._legend_of(kind)
             if self.mode == "live":
                 self._told.content = self._state()
-        return 32 * len(shown.centers) + at.nbytes // 2
+        return len(shown.centers), 32 * len(shown.centers) + 12 * len(at)
 
     def _background(self, kind: Kind) -> None:
         if self._still is None:
             return
-        view = (kind, self.eye) if kind == "picture" and self.pictures.still.sh.shape[1] > 1 else (kind, None)
         if self._drawn_from is not None and self._drawn_from[0] == kind:
             before = self._drawn_from[1]
             middle = self.run.body.position.double().mean(0).numpy()
-            if view[1] is None or np.linalg.norm(view[1] - before) < TURNED * np.linalg.norm(before - middle):
+            near = np.linalg.norm(self.eye - before) < TURNED * np.linalg.norm(before - middle)
+            if near or kind != "picture" or self.pictures.still.sh.shape[1] == 1:
                 return
-        self._drawn_from = view
+        self._drawn_from = kind, self.eye
         _send(self._still, self.pictures.background(kind, self.eye))
 
     def _follow_clip(self) -> None:
@@ -282,12 +281,14 @@ class Page:
             self._frame_of_clip, self._clip.image = frame, _enlarged(clip[frame].numpy())
 
     def _obey(self, what: str, *told: Any) -> None:
-        self.stale = True
         live = self.live
+        if what == "eye":
+            self.eye = told[0]
+            self.stale |= self.kind.value == "picture" and self.run.gaussians.sh.shape[1] > 1
+            return
+        self.stale = True
         if what == "time":
             self.mode, self.time, self.play.value = "run", float(self._clock.value), False
-        elif what == "eye":
-            self.stale = self._sees_otherwise(told[0])
         elif what == "poke":
             self.live = told[0]
             self._told.content = POKE
@@ -303,22 +304,17 @@ class Page:
             live.change(stiffness=self._stiffness.value, damping=self._damping.value)
         elif what == "rest":
             live.rest()
-            self._stressed_at, self.mode = 0.0, "live"
+            self.mode = "live"
         elif what == "back":
             self.mode, self.play.value, self._told.content = "run", True, POKE
         elif what == "save":
             self._keep(live)
 
-    def _sees_otherwise(self, eye: np.ndarray) -> bool:
-        """Whether colours change with the eye."""
-        self.eye = eye
-        return self.kind.value == "picture" and self.run.gaussians.sh.shape[1] > 1
-
     def _drag(self, live: Live, phase: str, which: int | None, start: np.ndarray, end: np.ndarray) -> None:
         if phase == "start" and which is not None:
             if self.mode == "run":
                 live.rest()
-                self._stressed_at, self.mode = 0.0, "live"
+                self.mode = "live"
             self.play.value = True
             self._grip = start
             live.grab(int(self._held_by[which]))
@@ -362,13 +358,13 @@ class Page:
         gradient = f'<div style="height:0.8em;background:linear-gradient(to right,{stops})"></div>'
         return f"<div {style}>{gradient}{low:.3g} to {high:.3g} {UNITS[kind]}</div>"
 
-    def rate(self) -> tuple[float, float, float, int]:
-        """(frames a second, [ms] of motion and of drawing, [byte] sent) of the last frames that followed each other."""
+    def rate(self) -> tuple[float, float, float, int, int]:
+        """(frames a second, [ms] of motion, of drawing, moving splats, [byte]) of the last frames without a pause."""
         spent = list(self._spent)
         if len(spent) < 2 or spent[-1][0] <= spent[0][0]:
-            return 0.0, 0.0, 0.0, 0
+            return 0.0, 0.0, 0.0, 0, 0
         motion, drawing = (1e3 * float(np.mean([s[k] for s in spent])) for k in (1, 2))
-        return (len(spent) - 1) / (spent[-1][0] - spent[0][0]), motion, drawing, spent[-1][3]
+        return (len(spent) - 1) / (spent[-1][0] - spent[0][0]), motion, drawing, *spent[-1][3:]
 
     def _say_rate(self, moving: bool) -> None:
         now = time.perf_counter()
@@ -379,10 +375,9 @@ class Page:
             self._spent.clear()
             self._rate.content = "**still**: nothing is sent"
             return
-        rate, motion, drawing, size = self.rate()
-        count = size // 32
+        rate, motion, drawing, count, size = self.rate()
         self._rate.content = (
-            f"**{rate:.1f} frames/s** of about {count} splats ({size / 1e6:.2f} MB a frame): "
+            f"**{rate:.1f} frames/s** of {count} moving splats ({size / 1e6:.2f} MB a frame): "
             f"motion {motion:.0f} ms, drawing {drawing:.0f} ms"
         )
 
