@@ -31,6 +31,7 @@ FOLLOWED = 3  # modes
 STEPS = 16  # in a period of the last of them: the midpoint rule is then late by a hundredth of a period in each
 LONGEST, SHORTEST = 1 / 60, 1 / 480  # [s] of a step
 MOST = 0.1  # of the clock that one call makes up for [s]
+STIFFEST = 0.02  # of the compliance of the softest place: near its hold the body resists no more than that
 STILL = 1e-4  # of its size per second: who moves less for a second has come to rest
 
 
@@ -80,17 +81,21 @@ class Live:
 
     def grab(self, particle: int) -> None:
         """Take hold of the body around a particle."""
+        model = self.stepper.solver.model
+        if model.conditions.held[particle]:
+            self.trouble = "this place is held and cannot be pulled; take another"
+            return
         x = self.body.position.double()
         centre, radius = place(x[particle].numpy(), self.world.dx)
         push = Impulse(force=(0.0, 0.0, 1.0), centre=centre, radius=radius, duration=1.0)
         lower, upper = ((float(a), float(b), float(c)) for a, b, c in (x.amin(0), x.amax(0)))
-        mass = torch.from_numpy(self.stepper.solver.model.particle_mass)
+        mass = torch.from_numpy(model.particle_mass)
         setting = Setting(position=x, mass=mass, lower=lower, upper=upper, dx=self.world.dx)
         share = self.stepper.share(push.selection(setting).numpy())
-        hold = Hold(share=share, compliance=self.stepper.compliance(share), displacement=np.zeros(3))
-        if not hold.compliance > 0:
-            self.trouble = "this place is held and cannot be pulled; take another"
-            return
+        # that of the first mode, where it moves most
+        softest = (np.linalg.norm(model.values @ model.shapes[0], axis=1).max() / model.omega[0]) ** 2
+        compliance = max(self.stepper.compliance(share), STIFFEST * softest)
+        hold = Hold(share=share, compliance=compliance, displacement=np.zeros(3))
         self.trouble, self.quiet = "", 0.0
         self.record = Record(centre=centre, radius=radius, dt=self.stepper.dt)
         self.hold = hold

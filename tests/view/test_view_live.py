@@ -15,7 +15,7 @@ from physics3d.view.live import Live, scaled
 from physics3d.world import World
 
 LOOKED = run(frames=2)
-TOP = int(LOOKED.body.position.sum(1).argmax())
+TOP = int((LOOKED.body.position - torch.tensor([0.0, 0.0, 0.4])).norm(dim=1).argmin())
 RECOVERING = [m for m in every_material() if m.recovers]
 
 
@@ -42,8 +42,8 @@ def test_held_for_long_the_body_follows_the_hand(made):
     moved = share @ made.stepper.q
     E, mu_N = 2e4, 6e3
     softer = (E / 2.6 + mu_N) / (E / 2.6)
-    # the fingertip is wide, so that some of the way is lost in the softest direction
-    assert 0.98 * way[0] < moved[0] < 1.02 * softer * way[0]
+    # the fingertip is half a particle off the axis: a little of the softest direction is a twist
+    assert 0.93 * way[0] < moved[0] < 1.02 * softer * way[0]
     made.let_go()
     for _ in range(15):
         made.advance(0.1)
