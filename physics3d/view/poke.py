@@ -6,7 +6,8 @@ rest, with the force
     F = d/c     [N]
 
 c [m/N] being how far this place gives way to a force at rest, before anything relaxes: the body follows the hand where
-it is linear, lags where it stiffens, and creeps further where it is viscous. What is kept is the force as it was, in a few windows of time with the mean of each,
+it is linear, lags where it stiffens, and creeps further where it is viscous. What is kept is the force as it was, in a
+few windows of time with the mean of each,
 
     impulse of a window = int F dt     exactly, in sum as well,
 
