@@ -55,8 +55,9 @@ class Record:
             mean = part.mean(0)
             if np.linalg.norm(mean) > FAINT * size.max():
                 x, y, z = (_written(c) for c in mean)
-                time = dict(start=_written(begin * self.dt), duration=_written(len(part) * self.dt))
-                found.append(Impulse(force=(x, y, z), centre=self.centre, radius=self.radius, **time))
+                start, duration = _written(begin * self.dt), _written(len(part) * self.dt)
+                push = Impulse(force=(x, y, z), centre=self.centre, radius=self.radius, start=start, duration=duration)
+                found.append(push)
             begin += len(part)
         return tuple(found)
 

@@ -39,7 +39,8 @@ def test_nothing_computed_yet(tmp_path):
 
 
 def test_a_scene_of_the_command_line_likewise(tmp_path, capsys):
-    assert main(["scene=trained", f"output={tmp_path}", "data=nowhere.ply"], {}) == 1
+    (tmp_path / "model.ply").touch()
+    assert main(["scene=trained", f"output={tmp_path}", f"data={tmp_path / 'model.ply'}"], {}) == 1
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and "make run SCENE=trained PROFILE=default" in error
     assert main(["scene=carnaton"], {}) == 2
@@ -88,9 +89,7 @@ def test_a_taken_port_is_named_with_the_remedy(whole):
     assert free(str(port), "127.0.0.1") == (port, "127.0.0.1")
 
 
-@pytest.mark.parametrize(
-    "port, host", [("0", "127.0.0.1"), ("70000", "127.0.0.1"), ("x", ""), ("8080", "203.0.113.7")]
-)
+@pytest.mark.parametrize("port, host", [("0", "127.0.0.1"), ("70000", "127.0.0.1"), ("x", ""), ("8080", "203.0.113.7")])
 def test_what_cannot_be_listened_on_is_refused(port, host):
     with pytest.raises(ValueError, match=r"PORT="):
         free(port, host)
