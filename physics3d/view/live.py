@@ -106,7 +106,7 @@ class Live:
             self.hold.displacement = displacement
 
     def let_go(self) -> None:
-        self.hold = None
+        self.hold, self.quiet = None, 0.0  # it may have been held still for long
 
     @property
     def force(self) -> Float[np.ndarray, "3"]:

@@ -85,7 +85,8 @@ class Page:
 
     def _scene(self) -> None:
         scene, pictures, body = self.server.scene, self.pictures, self.run.body
-        now, kind = pictures.moment(0), "picture"
+        now = pictures.moment(0)
+        kind: Kind = "picture"
         add = lambda name, s: scene.add_gaussian_splats(name, s.centers, s.covariances, s.rgbs, s.opacities)
         self._moving = add("/gaussians", pictures.gaussians(now, kind, self.eye))
         self._particles = add("/particles", pictures.particles(now, kind))
@@ -117,10 +118,10 @@ class Page:
         gui.main_panel.dock_right()
         self._rate = gui.add_markdown("")
         with gui.add_folder("Motion"):
-            self.play = gui.add_checkbox("play", True)
+            self.play: Any = gui.add_checkbox("play", True)
             self._speed = gui.add_slider("speed", min=0.1, max=2.0, step=0.1, initial_value=1.0)
             length = max((len(motion.position) - 1) / motion.fps, 1e-3)
-            self._clock = gui.add_slider("time [s]", min=0.0, max=length, step=length / 1000, initial_value=0.0)
+            self._clock: Any = gui.add_slider("time [s]", min=0.0, max=length, step=length / 1000, initial_value=0.0)
             home = gui.add_button("camera of the clip")
         with gui.add_folder("Colours"):
             kinds = [k for k in get_args(Kind) if k != "stress" or not self.pictures.no_stress]
@@ -154,10 +155,10 @@ class Page:
             beside.set_width(WIDE + 20)
 
         self._clock.on_update(lambda event: self.asked.put(("time",)) if event.client is not None else None)
-        for control in (self.kind, self._balls):
-            control.on_update(lambda _: self.asked.put(("look",)))
-        for control in (self._stiffness, self._damping):
-            control.on_update(lambda _: self.asked.put(("material",)))
+        for look in (self.kind, self._balls):
+            look.on_update(lambda _: self.asked.put(("look",)))
+        for slider in (self._stiffness, self._damping):
+            slider.on_update(lambda _: self.asked.put(("material",)))
         self.play.on_update(lambda event: self.asked.put(("play",)))
         self._rest.on_click(lambda _: self.asked.put(("rest",)))
         self._back.on_click(lambda _: self.asked.put(("back",)))
@@ -324,7 +325,7 @@ class Page:
             live.let_go()
 
     def _keep(self, live: Live) -> None:
-        notes = ()
+        notes: tuple[str, ...] = ()
         if (live.stiffness, live.damping) != (1.0, self.run.world.damping):
             notes = (f"poked at {live.stiffness:g} times the stiffness, and with world.damping={live.damping:g}",)
         try:

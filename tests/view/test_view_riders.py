@@ -22,7 +22,7 @@ def moved(X: torch.Tensor, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
     """A large bend and a turn that varies over the body."""
     generator = torch.Generator().manual_seed(seed)
     A = torch.eye(3) + 0.2 * torch.randn(3, 3, generator=generator)
-    B = torch.randn(3, 3, 3, generator=generator)
+    B = 0.3 * torch.randn(3, 3, 3, generator=generator)
     x = X @ A.T + torch.einsum("ijk,pj,pk->pi", B, X, X)
     return x, A + torch.einsum("ijk,pk->pij", B + B.transpose(1, 2), X)
 
