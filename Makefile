@@ -22,10 +22,12 @@ RUNNER ?=
 WORKERS ?=
 ADDRESS ?=
 PORT ?=
+LISTEN ?=
 PYTHON ?= python3
 # these may hold anything, quotes, semicolons and dollar signs too: they are taken as they stand, and reach commands by the
 # environment, never as a part of a line that a shell or make reads
-words := SCENE PROFILE METHOD DATA ARGS PYTHON REAL PRED OUT FORMAT FRAME SIZE LENGTH MATERIAL UNSEEN RESULT SCENES METHODS SEEDS RUNNER WORKERS ADDRESS PORT
+words := SCENE PROFILE METHOD DATA ARGS PYTHON REAL PRED OUT FORMAT FRAME SIZE LENGTH MATERIAL UNSEEN RESULT \
+	 SCENES METHODS SEEDS RUNNER WORKERS ADDRESS PORT LISTEN
 $(foreach name,$(words),$(eval override $(name) := $$(value $(name))))
 export $(words)
 
@@ -104,11 +106,8 @@ ui: $(ready) ## MLflow: prints the address of the page that compares runs, and s
 graph: $(ready) ## Prefect's picture of the last run: prints its address, and serves it
 	@$(py) -m pipeline.graph .
 
-view: ## the video and previews of the last run
-	@folder=artifacts/$$(cat artifacts/.latest 2>/dev/null || echo nowhere); \
-	test -d "$$folder" || { echo "error: nothing rendered yet; make run SCENE=$$SCENE"; exit 1; }; \
-	ls -d "$$folder"/*.mp4 "$$folder"/previews/*; \
-	if [ -n "$$DISPLAY$$WAYLAND_DISPLAY" ] && command -v xdg-open >/dev/null; then xdg-open "$$(ls "$$folder"/*.mp4 | head -1)"; fi
+view: $(ready) ## a finished run in the browser, and a poke that is simulated live: [PORT=8080] [LISTEN=127.0.0.1]
+	@$(threads) $(with_args) -m pipeline.view $(of_run)
 
 test: $(ready) ## everything that needs no GPU and no weights
 	@OMP_NUM_THREADS=1 $(with_args) -m pytest -n 2 --dist loadfile

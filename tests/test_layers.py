@@ -36,7 +36,18 @@ ROOMS = {
 ORCHESTRATION = ("prefect", "mlflow", "hydra", "omegaconf")
 # sam2 brings its own Hydra configuration files, which are read where its model is built
 EXCEPTIONS = {("physics3d.segmentation", "hydra"), ("physics3d.segmentation", "omegaconf")}
-HEAVY = ("diffusers", "transformers", "sam2", "open3d", "torchmetrics", "cv2", "matplotlib", "mlflow", "prefect")
+HEAVY = (
+    "diffusers",
+    "transformers",
+    "sam2",
+    "open3d",
+    "torchmetrics",
+    "cv2",
+    "matplotlib",
+    "mlflow",
+    "prefect",
+    "viser",
+)
 
 
 def module(path: Path) -> str:
