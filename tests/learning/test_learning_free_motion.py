@@ -113,7 +113,7 @@ def test_a_start_is_told_by_another_clip_of_the_same_thing(rng):
 
 
 def test_intervals_of_a_free_motion_hold_the_truth():
-    """12 clips whose noise lasts for frames, the best material found in each: 90 % intervals of the stiffness and of the
+    """12 clips whose noise lasts for frames, the best material found in each: 90 % intervals of the stiffness and the
     damping's two numbers hold the truth in 70 % or more (36 are counted; their sampling error is 5 %)."""
     body = chain(zones=1)
     truth = Material(stiffness=math.log(7.0), zones=np.zeros(1), ratio=math.log(0.4), time=math.log(0.06))
@@ -123,11 +123,10 @@ def test_intervals_of_a_free_motion_hold_the_truth():
     sight = Sight(thing=line, pixel=np.argwhere(line), jacobian=jacobian)
     known = np.array([truth.stiffness, truth.ratio, truth.time])
     none = Beyond(surface=0.0, grid=0.0, density=0.0, length=0.0)
-    hits, widths = 0, []
+    hits, widths, last = 0, [], 74 / FPS
     for seed in range(12):
         clip, (_, seen) = filmed(body, truth, np.random.default_rng(seed), noise=0.1, memory=0.7)
-        last = len(seen) - 1
-        cost = lambda theta, clip=clip: start(body, Material.of(np.append(theta, 0.0)), clip, reference=last / FPS)[1]
+        cost = lambda theta, clip=clip: start(body, Material.of(np.append(theta, 0.0)), clip, reference=last)[1]
         near = optimize.minimize(cost, known, method="Nelder-Mead", options=dict(maxfev=80))
         material = Material.of(np.append(near.x, 0.0))
         after = free_posterior(
@@ -137,7 +136,7 @@ def test_intervals_of_a_free_motion_hold_the_truth():
             sight=sight,
             flow=np.stack([seen, np.zeros_like(seen)], -1),
             weight=np.ones_like(seen),
-            reference=last / FPS,
+            reference=last,
             width=2.3,
             beyond=none,
             log=Log(None),
