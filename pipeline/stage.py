@@ -80,7 +80,7 @@ class Step:
             parts = made_of(config, keys, digests, files)
         except (ValueError, OSError) as error:
             raise StageError(f"{name}: {_one_line(error)}") from error
-        rest = {"inputs": inputs, "shelf": shelf, "fingerprint": hashed(parts), "made_of": parts}
+        rest: dict[str, Any] = {"inputs": inputs, "shelf": shelf, "fingerprint": hashed(parts), "made_of": parts}
         return cls(name=name, stage=stage, config=config, **rest)
 
     @classmethod

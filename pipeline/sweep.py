@@ -273,7 +273,7 @@ class _Work:
             known = step.folder in futures or step.folder in self.filed or step.folder in self.failed
             if not known and all(s.folder in self.filed for s in first_ones):
                 after = [futures.get(s.folder, self.filed[s.folder]) for s in first_ones]
-                task = as_task(step, variant.config["device"], variant.config["verify"])
+                task: Any = as_task(step, variant.config["device"], variant.config["verify"])
                 future = futures[step.folder] = task.submit(after)
                 future.add_done_callback(lambda future, step=step: ended.put((step, future)))
         error = error or next((self.failed[s.folder] for s in whole.steps if s.folder in self.failed), "")

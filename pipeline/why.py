@@ -99,7 +99,8 @@ def _nearest(step: Step) -> Step | None:
         except (OSError, ValueError):
             continue
         match told.get("made_of"):
-            case {"config": dict(), "code": dict(), "libraries": dict(), "inputs": list(), "data": dict()} as parts:
+            case {"config": dict(), "code": dict(), "libraries": dict(), "inputs": list(), "data": dict()}:
+                parts: dict[str, Any] = told["made_of"]
                 if _classes(parts) == _classes(step.made_of):
                     filed = Step(step.name, step.stage, {}, (), step.shelf, path.parent.name, parts)
                     count = len(differences(parts, step.made_of, [""] * len(parts["inputs"])))

@@ -101,8 +101,9 @@ def chain_of(
 
 def _stronger(boundaries: tuple[AbstractBoundary, ...], more: float) -> tuple[AbstractBoundary, ...]:
     """The same with forces exp(more) times as large; motions and accelerations stay."""
+    times = math.exp(more)
     return tuple(
-        replace(b, force=tuple(math.exp(more) * float(f) for f in b.force))
+        replace(b, force=(times * float(b.force[0]), times * float(b.force[1]), times * float(b.force[2])))
         if isinstance(b, Impulse) and b.force is not None and any(map(float, b.force))
         else b
         for b in boundaries

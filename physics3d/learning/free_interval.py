@@ -68,7 +68,7 @@ def free_posterior(
     shares = np.einsum("tn,tncx->tnx", weight, slope**2, optimize=True)
     picture = np.zeros((2 * len(flow), *sight.thing.shape))
     picture[:, *sight.pixel.T] = (residual * np.sqrt(weight)[..., None]).transpose(0, 2, 1).reshape(len(picture), -1)
-    block, count = blocks(*sight.pixel.T, correlation_length(picture))
+    block, count = blocks(sight.pixel[:, 0], sight.pixel[:, 1], correlation_length(picture))
     summed = lambda values: np.stack([np.bincount(block, v, count) for v in values])
     each = lambda values: np.stack([summed(values[..., i]) for i in range(len(theta))], -1)
     stiff = np.eye(len(theta))[0]

@@ -81,7 +81,8 @@ def shown(chain: Chain, field: GlobalField, theta: Tensor, *, seed: int, step: f
         counts = whole > 1e-6 * float(whole.max()) if whole.any() else whole == 0
         t, c = len(g), g.shape[-1]
         residual = (g * counts[..., None]).transpose(0, 3, 1, 2).reshape(t * c, *counts.shape)
-        block, number = blocks(*np.nonzero(counts), correlation_length(residual))
+        row, column = np.nonzero(counts)
+        block, number = blocks(row, column, correlation_length(residual))
         summed = lambda values, counts=counts, block=block, number=number: np.stack(
             [[np.bincount(block, f[counts, i], number) for i in range(k)] for f in values]
         ).transpose(0, 2, 1)

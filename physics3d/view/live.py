@@ -90,7 +90,8 @@ class Live:
         push = Impulse(force=(0.0, 0.0, 1.0), centre=centre, radius=radius, duration=1.0)
         lower, upper = ((float(a), float(b), float(c)) for a, b, c in (x.amin(0), x.amax(0)))
         mass = torch.from_numpy(model.particle_mass)
-        setting = Setting(position=x, mass=mass, lower=lower, upper=upper, dx=self.world.dx)
+        volume = torch.from_numpy(model.particle_mass / self.world.density)
+        setting = Setting(position=x, mass=mass, volume=volume, lower=lower, upper=upper, dx=self.world.dx)
         share = self.stepper.share(push.selection(setting).numpy())
         # that of the first mode, where it moves most
         softest = (np.linalg.norm(model.values @ model.shapes[0], axis=1).max() / model.omega[0]) ** 2
