@@ -22,10 +22,10 @@ from physics3d.metrics.scores import REFERENCE
 from physics3d.motion.stills import FIRST, LAST, MEAN
 from pipeline.settings import compose
 from pipeline.stage import build
-from stages.foretell import IMAGE, LEARNED, START
+from stages.foretell import IMAGE, LEARNED, SEEN, START
 
 RESULTS = Path(__file__).resolve().parent.parent / "docs" / "results"
-ROWS = (LEARNED, START, IMAGE, LAST, MEAN, FIRST)
+ROWS = (SEEN, LEARNED, START, IMAGE, LAST, MEAN, FIRST)
 MEASURES = ("psnr", "ssim", "ms_ssim", "vmaf", "flow_error", "frequency", "damping")
 
 
@@ -83,10 +83,10 @@ def write(rows: list[dict], said: list[str]) -> None:
     }
     text += [f"| mean | {' | '.join(cell(means[name]) for name in ROWS)} |", ""]
     text += ["## Motion: flow error, frequency [Hz], damping [1/s] of what was foretold and of what came", ""]
-    text += ["| take | flow error, learned | image modes | frequency | recorded | damping | recorded |"]
+    text += ["| take | flow error, modes as seen | image modes | frequency | recorded | damping | recorded |"]
     text += ["|---" * 7 + "|"]
     for take in takes:
-        mine, image, real = (found[(*take, name)] for name in (LEARNED, IMAGE, REFERENCE))
+        mine, image, real = (found[(*take, name)] for name in (SEEN, IMAGE, REFERENCE))
         values = (mine["flow_error"], image["flow_error"], mine["frequency"], real["frequency"])
         values += mine["damping"], real["damping"]
         text.append(f"| {' '.join(take)} | {' | '.join('–' if v is None else f'{v:.3g}' for v in values)} |")
@@ -105,8 +105,8 @@ def plot(takes: list, found: dict) -> None:
     figure = Figure(figsize=(1.6 * len(takes) + 2, 3.4), layout="constrained")
     axis = figure.add_subplot()
     for i, name in enumerate(ROWS):
-        at = np.arange(len(takes)) + 0.13 * (i - 2.5)
-        axis.bar(at, [found[(*take, name)]["psnr"] for take in takes], 0.12, label=name)
+        at = np.arange(len(takes)) + 0.11 * (i - 3)
+        axis.bar(at, [found[(*take, name)]["psnr"] for take in takes], 0.1, label=name)
     axis.set_xticks(range(len(takes)), ["\n".join(take) for take in takes], fontsize=8)
     axis.set(ylabel="PSNR [dB]", ylim=(18, None))
     axis.legend(frameon=False, fontsize=8, ncols=3)

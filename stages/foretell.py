@@ -1,8 +1,9 @@
-"""Recorded motions of unknown cause -> what comes next, as the material says, beside what it says without physics.
+"""Recorded motions of unknown cause -> what comes next, beside what pictures say without physics.
 
 Of the take that was learned from the second half is foretold, of the others all that follows their first half second
-from the release on, in which only their start is sought. Every prediction stands beside still pictures, the image
-modes of what was seen, and the material before it was learned.
+from the release on, in which only their start is sought. The prediction is by the modes of the body as the first take
+shows them (`learning/identify.py`); beside it stand still pictures, the image modes of what was seen, and the motion
+of the learned material alone, and of the material before it was learned, in modes that nothing has corrected.
 """
 
 import math
@@ -19,7 +20,8 @@ from physics3d.filling.body import Body
 from physics3d.gaussians.model import Gaussians
 from physics3d.learning.foretold import foretold
 from physics3d.learning.free_body import material_of
-from physics3d.learning.free_motion import Material, start
+from physics3d.learning.free_motion import FreeMotion, Material, start
+from physics3d.learning.identify import Swing, another_take, identified
 from physics3d.learning.seen_modes import observe
 from physics3d.learning.unknown_cause import Swung, by_its_own_camera, first_take, frames_seen, swung
 from physics3d.log import Log
@@ -34,7 +36,8 @@ from physics3d.scenes.base import Capture, Take
 from physics3d.video import write_mp4
 from physics3d.world import Estimate, World
 
-LEARNED, START, IMAGE = "learned material", "material before", "image modes"
+SEEN, LEARNED, START, IMAGE = "modes as seen", "learned material", "material before", "image modes"
+Moving = FreeMotion | Swing
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +52,7 @@ class Foretell:
         """Rows are "take: prediction". Raises ValueError as `swung` does."""
         require_fields(self, "foretell")
         ready = swung(self.world, capture, gaussians, body, zones=self.zones, log=log)
-        clip, flow, _, _, release = first_take(ready, log)
+        clip, flow, _, decay, release = first_take(ready, log)
         learned = material_of(self.world, estimate, ready.reduced.zone)
         before = material_of(self.world, self.world.estimate(), ready.reduced.zone)
         take, posed = ready.take, ready.take.posed
@@ -57,19 +60,21 @@ class Foretell:
         scores: dict[str, dict[str, float | None]] = {}
         notes: dict[str, str] = {}
         reference = None if take.at_rest else (posed - release) / take.fps
-        pose: dict[str, np.ndarray | None] = {}
         seen = frames_seen(take)
-        motions = {}
+        window = clip.window(release, seen)
+        swing = identified(ready.reduced, window, decay, reference=reference, log=log)
+        for j in range(len(swing.modes.frequency)):
+            log.metric(f"frequency_{j}", float(swing.modes.frequency[j]))
+            log.metric(f"damping_{j}", float(swing.modes.damping[j]))
+        motions: dict[str, Moving] = {SEEN: swing}
         for name, material in ((LEARNED, learned), (START, before)):
-            window = clip.window(release, seen)
-            motion, _ = start(ready.reduced, material, window, reference=reference)
-            motions[name] = motion
-            pose[name] = None if reference is None else motion.at(reference)
+            motions[name] = start(ready.reduced, material, window, reference=reference)[0]
+        pose = {name: None if reference is None else motion.at(reference) for name, motion in motions.items()}
         scores |= self.judged(ready, take, motions, flow[-1], release=release, seen=seen, notes=notes, log=log)
         for other in capture.takes:
             if other is not take:
                 own = ready if other.posed is None else by_its_own_camera(ready, other, gaussians, body)
-                scores |= self.other(own, other, {LEARNED: learned, START: before}, pose, notes, log)
+                scores |= self.other(own, other, swing, {LEARNED: learned, START: before}, pose, notes, log)
         table = Scores(values=scores, notes=notes)
         table.check()
         for row, cells in scores.items():
@@ -84,6 +89,7 @@ class Foretell:
         self,
         ready: Swung,
         take: Take,
+        first: Swing,
         materials: dict[str, Material],
         pose: dict[str, np.ndarray | None],
         notes: dict[str, str],
@@ -96,22 +102,18 @@ class Foretell:
             notes[take.name] = f"{len(frames)} frames, free from {release} on, are too few to be foretold"
             return {}
         clip, flow, _ = observe(ready.sight, frames[:seen], take.fps, reference=ready.picture)
-        motions = {
-            name: start(
-                ready.reduced,
-                material,
-                clip.window(release, seen),
-                known=None if take.at_rest else pose[name],
-            )[0]
-            for name, material in materials.items()
-        }
+        window = clip.window(release, seen)
+        known = {name: None if take.at_rest else place for name, place in pose.items()}
+        motions: dict[str, Moving] = {SEEN: another_take(ready.reduced, window, first.modes, known[SEEN])}
+        for name, material in materials.items():
+            motions[name] = start(ready.reduced, material, window, known=known[name])[0]
         return self.judged(ready, take, motions, flow[-1], release=release, seen=seen, notes=notes, log=log)
 
     def judged(
         self,
         ready: Swung,
         take: Take,
-        motions: dict,
+        motions: dict[str, Moving],
         moved: np.ndarray,
         *,
         release: int,
@@ -142,15 +144,15 @@ class Foretell:
         if log.folder is None:
             return
         future = take.videos[0][seen:]
-        write_mp4(log.path(f"{take.name}.mp4"), torch.cat([future, clips[LEARNED]], 2), take.fps)
-        log.image(f"{take.name}_frames", contact_sheet(torch.cat([future, clips[LEARNED]], 1), columns=8, count=8))
+        write_mp4(log.path(f"{take.name}.mp4"), torch.cat([future, clips[SEEN]], 2), take.fps)
+        log.image(f"{take.name}_frames", contact_sheet(torch.cat([future, clips[SEEN]], 1), columns=8, count=8))
         lines = {
             "PSNR [dB]": {name: psnr_per_frame(clip, future) for name, clip in clips.items()},
             "SSIM": {name: ssim_per_frame(clip, future) for name, clip in clips.items()},
         }
         log.image(f"{take.name}_curves", curves(lines, take.fps, first=seen))
-        shown = ["recorded", LEARNED, IMAGE]
-        log.image(f"{take.name}_slices", slices(shown, [future, clips[LEARNED], clips[IMAGE]], *busiest(future)))
+        shown = ["recorded", SEEN, IMAGE]
+        log.image(f"{take.name}_slices", slices(shown, [future, clips[SEEN], clips[IMAGE]], *busiest(future)))
 
 
 def _plain(cells, name: str, notes: dict[str, str]) -> dict[str, float | None]:

@@ -12,6 +12,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from physics3d.learning.free_motion import FreeMotion
+from physics3d.learning.identify import Swing
 from physics3d.learning.seen_modes import Sight
 from physics3d.motion.carry import carried, inverse
 
@@ -21,7 +22,7 @@ SMOOTH = 1.5  # of the displacement [px]
 def foretold(
     photograph: UInt8[Tensor, "h w 3"],
     sight: Sight,
-    motion: FreeMotion,
+    motion: FreeMotion | Swing,
     moved: Float[np.ndarray, "h w 2"],
     *,
     last: float,

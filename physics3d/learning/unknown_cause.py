@@ -15,7 +15,7 @@ from physics3d.learning.interval import Beyond
 from physics3d.learning.seen_modes import Observed, Sight, observe, sight
 from physics3d.log import Log
 from physics3d.modes.model import Model
-from physics3d.motion.decay import Decay
+from physics3d.motion.decay import Decay, fit_decay
 from physics3d.motion.release import free_decay
 from physics3d.motion.shapes import moving, shapes
 from physics3d.scenes.base import Capture, Take
@@ -78,7 +78,11 @@ def first_take(
         raise ValueError(f"take {body.take.name}: nothing moves in the {len(frames)} frames that are seen")
     where &= body.sight.thing
     weight = np.ones(u.shape[:3], np.float32)
-    decay, release = free_decay(shapes(u, weight, where, count=SHAPES).signal, body.take.fps)
+    signal = shapes(u, weight, where, count=SHAPES).signal
+    decay, release = free_decay(signal, body.take.fps)
+    if release < body.take.release <= len(frames) - LEAST:
+        release = body.take.release  # known from elsewhere, a person or the whole clip
+        decay = fit_decay(signal, body.take.fps, first=release)
     if decay.main() is None:
         raise ValueError(
             f"take {body.take.name}: what moves does not swing; a material is learned from what has been let go"
