@@ -221,7 +221,7 @@ ZERO_IS_FINE = re.compile(
     r"enclosure|hardening|hardening_modulus|second_modulus|cubic_modulus|viscosity|power_index|checkpoint_bytes|held_out_cameras\.\d+)$|"
     r"rates\.(?!final)\w+$|beyond\.\w+$|blur\.\d$|(positive|negative)\.\d+\.\d$"
 )
-ENDLESS = re.compile(r"(shear|bulk)_relaxation_time$")
+ENDLESS = re.compile(r"(shear|bulk)_relaxation_time(_[23])?$")
 NULL_IS_FINE = re.compile(
     r"(resolution|sheet_thickness|learn\.duration|floaters|variant|simulate\.force|render\.view|world\.(dt|checkpoint_bytes)|"
     r"prompts\.\d\.box)$"

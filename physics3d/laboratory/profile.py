@@ -16,7 +16,8 @@ from scipy import optimize
 
 WALK = (0.1, 0.25, 0.5, 1.0)  # of the way to the bound
 HALVINGS = 2  # between the last point that the tests allow and the first that they do not
-EVALUATIONS = 6  # of a fit of the others, which starts nearby
+EVALUATIONS = 25  # at most, of a fit of the others
+ENOUGH = 1e-3  # change of the sum of squares, or of a parameter, at which it stops: the limit is a tenth or so away
 
 Vector = Float[np.ndarray, " p"]
 
@@ -52,7 +53,7 @@ def _end(theta, i: int, bound: float, bounds, residuals, slopes, limit: float) -
 
         found = optimize.least_squares(
             lambda x: residuals(full(x)), np.clip(point[others], inside[0] + 1e-9, inside[1] - 1e-9),
-            lambda x: slopes(full(x))[:, others], bounds=inside, max_nfev=EVALUATIONS,
+            lambda x: slopes(full(x))[:, others], bounds=inside, max_nfev=EVALUATIONS, ftol=ENOUGH, xtol=ENOUGH,
         )  # fmt: skip
         return 2 * found.cost <= limit, full(found.x)
 
