@@ -32,7 +32,8 @@ def test_held_for_long_the_body_follows_the_hand(made):
     """The relaxed branch gives way further than the stiffness that the force is measured by: between 1 and
     (E + E_N)/E of the way, and all of it where the branch does not relax."""
     made.rest()
-    made.change(stiffness=1.0, damping=18.0)  # critical for the first mode, of 1.4 Hz: its rest is e^-11 after 1.5 s
+    # 1.4 Hz as long as the branch is stuck, 1.1 Hz relaxed, for which this is nearly critical: e^-7 is left of it
+    made.change(stiffness=1.0, damping=13.0)
     made.grab(TOP)
     way = np.array([0.004, 0.0, 0.0])
     made.pull(way)
@@ -47,7 +48,7 @@ def test_held_for_long_the_body_follows_the_hand(made):
     made.let_go()
     for _ in range(15):
         made.advance(0.1)
-    assert np.abs(made.stepper.particles()[0] - LOOKED.body.position).max() < 0.02 * way[0]  # it comes back
+    assert np.abs(made.stepper.particles()[0] - LOOKED.body.position).max() < 0.05 * way[0]  # it comes back
 
 
 def test_what_is_kept_is_what_the_hand_did(made):
