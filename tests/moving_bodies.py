@@ -61,6 +61,7 @@ def moving(harmonics: int, opening: bool = False) -> tuple[Moving, Body]:
         rest_position=X,
         position=torch.einsum("tij,pj->tpi", F, X)
         + torch.arange(FRAMES)[:, None, None] * torch.tensor([0.1, 0.0, 0.02]),
+        velocity=torch.zeros(FRAMES, len(X), 3),  # nobody asks
         deformation=F[:, None].expand(FRAMES, len(X), 3, 3).contiguous(),
         fps=FPS,
         health={},

@@ -165,7 +165,7 @@ def mentioned() -> list[str]:
     pattern = (
         r"(?<![\w./])((?:world|reconstruct|segment|fill|learn|simulate|render|prior|masker|scene)\.[a-z_]+)\b(?![(.])"
     )
-    modules = r"\.(py|yaml|md|md\)|csv|fit|fields|base|name)$"
+    modules = r"\.(py|yaml|md|md\)|csv|html|fit|fields|base|name)$"
     words = set()
     for file in [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]:
         words |= set(re.findall(pattern, file.read_text()))

@@ -97,9 +97,10 @@ def imported_at_the_top(path: Path) -> set[str]:
 
 def test_importing_the_project_needs_no_more_than_its_dependencies():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    declared = {"".join(c if c.isalnum() or c in "-_." else " " for c in d).split()[0] for d in project["dependencies"]}
+    names = ["".join(c if c.isalnum() or c in "-_." else " " for c in d).split()[0] for d in project["dependencies"]]
+    declared = {name.lower() for name in names}
     installs = packages_distributions()
     files = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
     used = set().union(*map(imported_at_the_top, files)) - set(PACKAGES)
-    missing = {name for name in used if name in installs and not declared & set(installs[name])}
+    missing = {name for name in used if name in installs and not declared & {known.lower() for known in installs[name]}}
     assert not missing, f"imported, but no dependency in pyproject.toml: {sorted(missing)}"

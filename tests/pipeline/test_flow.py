@@ -114,7 +114,7 @@ def test_a_run_its_record_and_the_run_after_it(tmp_path, prefect):
     assert process.returncode == 0, out + err
     assert "computed" in out and "reused" not in out and address(tmp_path) in out
     table = [line.split() for line in out.splitlines()]
-    assert ["youngs_modulus", "1", "1.5", "2"] in table  # start, learned, truth
+    assert ["youngs_modulus", "1", "1.5", "as", "given", "2"] in table  # start, learned, no interval, truth
     assert ["learned", "11", "-"] in table, out  # every stage added its 1 to what it was given
 
     with sqlite3.connect(tmp_path / "mlflow.db") as record:

@@ -92,7 +92,7 @@ def from_a_shell(**env: str) -> dict[str, str]:
 def made(tmp_path):
     """make in a folder whose .venv/bin/python says what it was called with and by which environment."""
     shutil.copy(ROOT / "Makefile", tmp_path)
-    for name in ("pyproject.toml", "constraints.txt"):
+    for name in ("pyproject.toml", "setup.py", "constraints.txt"):
         (tmp_path / name).touch()
     python = tmp_path / ".venv" / "bin" / "python"
     python.parent.mkdir(parents=True)
@@ -104,7 +104,8 @@ def made(tmp_path):
     def call(*words: str, **env: str) -> tuple[list[str], dict[str, str]]:
         done = subprocess.run(["make", *words], cwd=tmp_path, env=from_a_shell(**env), capture_output=True)
         assert done.returncode == 0, done.stderr.decode(errors="replace")
-        assert {p.name for p in tmp_path.iterdir()} == {"Makefile", ".venv", "pyproject.toml", "constraints.txt"}
+        there = {"Makefile", ".venv", "pyproject.toml", "setup.py", "constraints.txt"}
+        assert {p.name for p in tmp_path.iterdir()} == there
         return tuple(json.loads(done.stdout))
 
     return call
