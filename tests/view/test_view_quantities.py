@@ -26,7 +26,8 @@ def test_the_speed_of_a_harmonic_motion():
     way = torch.tensor([0.03, 0.0, 0.04])  # 0.05 m
     x = X.double() + (torch.sin(omega * t)[:, None] * way)[:, None]
     F = torch.eye(3).expand(frames, len(X), 3, 3).contiguous()
-    found = speeds(replace(motion, position=x, deformation=F, fps=fps))
+    still = torch.zeros(frames, len(X), 3)  # speeds are of places, frame by frame
+    found = speeds(replace(motion, position=x, velocity=still, deformation=F, fps=fps))
     expected = 0.05 * omega * np.abs(np.cos(omega * t.numpy()))
     # central differences: (omega/fps)^2/6 of the largest, and one-sided at the ends
     np.testing.assert_allclose(found[1:-1, 7], expected[1:-1], atol=0.3 * (omega / fps) ** 2)
