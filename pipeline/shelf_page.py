@@ -68,7 +68,8 @@ def before(key: str, told: Manifests) -> set[str]:
         at = ahead.pop()
         if at not in found:
             found.add(at)
-            ahead += [k for entry in told.get(at, {}).get("inputs", ()) for k in re.findall(r"[0-9a-f]{8,}", entry)]
+            made_of = told.get(at, {}).get("made_of", {})
+            ahead += [k for entry in made_of.get("inputs", ()) for k in re.findall(r"[0-9a-f]{8,}", str(entry))]
     return found
 
 

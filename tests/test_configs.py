@@ -227,7 +227,7 @@ NULL_IS_FINE = re.compile(
     r"prompts\.\d\.box)$"
 )
 WORD_IS_FINE = re.compile(r"(prompts\.\d\.view|render\.view)$")
-CHOICES = re.compile(r"(kind|precision|scheme|solver|spring|flow|isolated|attach|device|learn\.\d|ties\.\d\.\d)$")
+CHOICES = re.compile(r"(kind|precision|scheme|solver|spring|flow|isolated|attach|device|learn\.\d+|ties\.\d\.\d)$")
 ORDERED = re.compile(r"(lower|upper|box|sigma|time)\.\d$")  # whether one number can be depends on its neighbours
 BAD = [math.nan, math.inf, -1, 0, 1e30, 1.5, "word", ["a", "list"], None]
 
@@ -255,6 +255,8 @@ def legal(key: str, old: Any, new: Any) -> bool | None:
     if new == -1:
         return None if key.endswith("poissons_ratio") else bool(SIGNED.search(key))
     if new == 0:
+        if key == "material.model.branches":
+            return None  # a viscoelastic solid may have its elastic branch alone, a solid with branches needs one
         if re.search(r"\.normal\.|\.up\.", key):
             return None
         return bool(SIGNED.search(key) or ZERO_IS_FINE.search(key))

@@ -26,12 +26,8 @@ def stiffness(material: AbstractMaterial, parameters: Values, count: int) -> Flo
 
 
 def speeds(trajectory: Trajectory) -> Float[np.ndarray, "t p"]:
-    """[m/s] in every frame; one frame alone stands still."""
-    velocity = getattr(trajectory, "velocity", None)
-    if velocity is None:
-        x = trajectory.position.double().numpy()
-        velocity = np.gradient(x, 1 / trajectory.fps, axis=0) if len(x) > 1 else np.zeros_like(x)
-    return np.linalg.norm(np.asarray(velocity), axis=2)
+    """[m/s] in every frame."""
+    return np.linalg.norm(trajectory.velocity.numpy(), axis=2)
 
 
 class Stress:
