@@ -1,7 +1,6 @@
 """What colours say: speeds, stiffness and stress against closed forms."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
