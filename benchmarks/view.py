@@ -171,7 +171,7 @@ class Client:
 
 
 def picture(run: Run, path: Path) -> None:
-    """The page while a hand pulls, coloured by stress, as Chromium draws it."""
+    """The page while a hand pulls, as Chromium draws it."""
     from PIL import Image
 
     page, end = served(run)
