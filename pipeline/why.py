@@ -98,8 +98,9 @@ def _nearest(step: Step) -> Step | None:
             told = read_manifest(path.parent)
         except (OSError, ValueError):
             continue
-        match told.get("made_of"):
-            case {"config": dict(), "code": dict(), "libraries": dict(), "inputs": list(), "data": dict()} as parts:
+        parts: Any = told.get("made_of")
+        match parts:
+            case {"config": dict(), "code": dict(), "libraries": dict(), "inputs": list(), "data": dict()}:
                 if _classes(parts) == _classes(step.made_of):
                     filed = Step(step.name, step.stage, {}, (), step.shelf, path.parent.name, parts)
                     count = len(differences(parts, step.made_of, [_named(source) for source in step.inputs]))
