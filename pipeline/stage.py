@@ -20,7 +20,7 @@ import shutil
 import statistics
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
@@ -80,8 +80,7 @@ class Step:
             parts = made_of(config, keys, digests, files)
         except (ValueError, OSError) as error:
             raise StageError(f"{name}: {_one_line(error)}") from error
-        rest: dict[str, Any] = {"inputs": inputs, "shelf": shelf, "fingerprint": hashed(parts), "made_of": parts}
-        return cls(name=name, stage=stage, config=config, **rest)
+        return cls(name, stage, config, inputs, shelf, hashed(parts), parts)
 
     @classmethod
     def take(cls, name: str, stage: str, key: str, shelf: Path) -> "Step":
@@ -290,7 +289,7 @@ def build(config: Any, device: str, where: str = "") -> Any:
         raise ValueError(f"{where}: {error}") from error
 
 
-def as_task(step: Step, device: str, verify: bool) -> Callable[..., Filed]:
+def as_task(step: Step, device: str, verify: bool) -> Any:
     """The step as a Prefect task; call it with the results of the steps before it, so that Prefect draws the graph.
 
     It may run in another process, or on another machine, with the same code and the same shelf. `device` is `auto`

@@ -63,9 +63,9 @@ def explain(config: dict[str, Any], shelf: Path) -> Iterator[str]:
         yield f"{name:>16} | left out: {why}"
     if guessed:
         yield f"{'':>16} | {guessed}"
-    if waiting:
+    if waiting and len(whole.steps) > 1:
         yield f"{waiting} of {len(whole.steps)} steps would run; those here took {seconds:.0f} s in other runs"
-    else:
+    elif not waiting:
         yield f"up to date: all {len(whole.steps)} steps were computed before"
 
 
@@ -98,12 +98,12 @@ def _nearest(step: Step) -> Step | None:
             told = read_manifest(path.parent)
         except (OSError, ValueError):
             continue
-        match told.get("made_of"):
+        parts: Any = told.get("made_of")
+        match parts:
             case {"config": dict(), "code": dict(), "libraries": dict(), "inputs": list(), "data": dict()}:
-                parts: dict[str, Any] = told["made_of"]
                 if _classes(parts) == _classes(step.made_of):
                     filed = Step(step.name, step.stage, {}, (), step.shelf, path.parent.name, parts)
-                    count = len(differences(parts, step.made_of, [""] * len(parts["inputs"])))
+                    count = len(differences(parts, step.made_of, [_named(source) for source in step.inputs]))
                     found.append((-count, str(told.get("finished")), filed))
     return max(found, key=lambda entry: entry[:2])[2] if found else None
 
@@ -113,13 +113,15 @@ def _classes(parts: dict[str, Any]) -> dict[str, Any]:
     return {k: v for k, v in flatten(parts["config"]).items() if k in ("_target_", "source._target_", "source.name")}
 
 
-def differences(old: dict[str, Any], new: dict[str, Any], inputs: list[str]) -> list[str]:
-    """One line for each entry in which two results are made of different things; `inputs` are the names of those."""
-    lines = [
-        f"input          {name} is another one"
-        for name, then, now in zip(inputs, old["inputs"], new["inputs"], strict=False)
-        if then != now
-    ]
+def differences(old: dict[str, Any], new: dict[str, Any], inputs: list[Any]) -> list[str]:
+    """One line for each entry in which two results are made of different things; `inputs` are the names of the inputs,
+    or mappings to names, as `new["inputs"]` has them."""
+    lines = []
+    for name, then, now in zip(inputs, old["inputs"], new["inputs"], strict=False):
+        pairs = [(name, then, now)]
+        if isinstance(name, dict) and isinstance(then, dict):
+            pairs = [(name[key], then.get(key), now[key]) for key in now]
+        lines += [f"input          {one} is another one" for one, was, is_now in pairs if was != is_now]
     for kind in KINDS:
         then, now = flatten(old[kind]), flatten(new[kind])
         for key in sorted(then.keys() | now.keys()):
@@ -147,11 +149,11 @@ _LINES = {
 }
 
 
-def _named(source: Any) -> str:
+def _named(source: Any) -> Any:
     if source is None:
         return "what was there"
     if isinstance(source, dict):
-        return " or ".join(step.name for step in source.values())
+        return {key: step.name for key, step in source.items()}
     return source.step.name if hasattr(source, "step") else source.name
 
 

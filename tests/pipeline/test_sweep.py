@@ -1,12 +1,10 @@
 """Many runs at once on Prefect's runners: what they share is done once, a killed worker loses nothing, one table."""
 
 import csv
-import json
 import os
 import signal
 import sqlite3
-import subprocess
-import sys
+import threading
 import time
 from collections import Counter
 from dataclasses import replace
@@ -18,16 +16,6 @@ from toy import ALL, configuration
 from pipeline.settings import SettingsError
 from pipeline.stage import read_manifest
 from pipeline.sweep import Crew, Variant, asked, run
-
-ROOT = Path(__file__).resolve().parent.parent.parent
-RUN = """
-import json, sys
-from pathlib import Path
-from test_sweep import variants
-from pipeline.sweep import Crew, run
-if __name__ == "__main__":
-    sys.exit(run(Crew(runner=sys.argv[1], workers=2, address=""), variants(Path(sys.argv[2]), json.loads(sys.argv[3]))))
-"""
 
 
 def variants(folder: Path, changes: list[dict]) -> list[Variant]:
@@ -50,26 +38,31 @@ def diary(folder: Path) -> list[str]:
     return (folder / "diary").read_text().splitlines() if (folder / "diary").exists() else []
 
 
-@pytest.mark.parametrize("runner", ["dask", "process"])
-def test_a_worker_killed_in_the_middle_loses_nothing(folder, prefect, runner):
-    """Two variants that differ in what is learned, on two workers; the one that learns first is killed."""
-    changes = [{"learn": {"modulus": 1.5}}, {"learn": {"modulus": 2.5}}]
-    (folder / "stop in learn").touch()
-    call = [sys.executable, "-c", RUN, runner, str(folder), json.dumps(changes)]
-    pipe = subprocess.PIPE
-    process = subprocess.Popen(call, stdout=pipe, stderr=pipe, text=True, env=prefect, cwd=ROOT, start_new_session=True)
+def kill_one_of_two(folder: Path, seen: list[str]) -> None:
+    """Wait until two workers are learning, kill the first, and let the others go on."""
     at_work = folder / "processes in learn"
     while len(at_work.read_text().splitlines() if at_work.exists() else []) < 2:
-        assert process.poll() is None, process.communicate()
         time.sleep(0.05)
-    workers = at_work.read_text().split()
-    assert len(set(workers)) == 2 and str(process.pid) not in workers, "they learn side by side"
-    before = set((folder / "artifacts").glob("[!.]*/[!.]*"))
-    os.kill(int(workers[0]), signal.SIGKILL)
-    time.sleep(0.2)
+    seen += [*at_work.read_text().split(), *map(str, (folder / "artifacts").glob("[!.]*/[!.]*"))]
+    os.kill(int(seen[0]), signal.SIGKILL)
     (folder / "stop in learn").unlink()
-    out, err = process.communicate()
-    assert process.returncode == 0, out + err
+
+
+@pytest.mark.parametrize("runner", ["dask", "process"])
+def test_a_worker_killed_in_the_middle_loses_nothing(folder, prefect, runner, monkeypatch, capsys):
+    """Two variants that differ in what is learned, on two workers."""
+    for name in ("PYTHONPATH", "OMP_NUM_THREADS"):
+        monkeypatch.setenv(name, prefect[name])
+    (folder / "stop in learn").touch()
+    seen: list[str] = []
+    killer = threading.Thread(target=kill_one_of_two, args=(folder, seen), daemon=True)
+    killer.start()
+    changes = [{"learn": {"modulus": 1.5}}, {"learn": {"modulus": 2.5}}]
+    code = run(Crew(runner=runner, workers=2, address=""), variants(folder, changes))
+    out, err = capsys.readouterr()
+    assert code == 0, out + err
+    assert len({*seen[:2], str(os.getpid())}) == 3, "they learn side by side, elsewhere"
+    before = set(map(Path, seen[2:]))
     # each step was computed once, but for what was under way: Dask loses one worker, a broken pool both
     wanted = Counter([*ALL[:5], *["learn", "simulate", "render", "evaluate"] * 2, "simulate", "render"])  # the guess's
     again = Counter(diary(folder)) - wanted

@@ -63,9 +63,7 @@ def test_an_entry_of_the_configuration_with_its_old_and_new_value(tmp_path):
     assert waiting(said) == {"learn", "simulate", "render", "evaluate"}  # as a run would: test_flow.py
     assert said["learn"][1:] == ["configuration modulus: 1.5 -> 1.75"]
     assert said["simulate"][1:] == ["input learn is another one"]
-    assert said["evaluate"][1:] == [
-        f"input {name} is another one" for name in ("render or render_initial", "learn or guess")
-    ]
+    assert said["evaluate"][1:] == ["input render is another one", "input learn is another one"]
     assert said[""][0].startswith(f"4 of {len(ALL)} steps would run")
 
 
