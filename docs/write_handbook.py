@@ -26,7 +26,8 @@ each: `thing: {stem: stem, petals: petal}`. Then
 
 Numbers are `value x/ factor`, the factor of one standard deviation of the logarithm; two of three things of that name
 are thought to lie between value/factor and value times factor. For nu the factor is of K/mu, and its range is given.
-They are typical ranges of textbooks and papers, as cited, or assumed where the source says so: a start for learning and
+They are typical ranges of textbooks and papers, as cited, or assumed where the source says so; they were written down
+from memory of these sources and **have not yet been checked against them**: a start for learning and
 a reminder of what is usual, not data of any one thing. Stiffness is that of the substance as an isotropic solid; a
 thing that is hollow, thin, layered or woven may be far from it in bending.
 """

@@ -18,9 +18,9 @@ from torch import Tensor
 from physics3d.checks import Duration, require_fields
 from physics3d.filling.body import Body
 from physics3d.gaussians.model import Gaussians
-from physics3d.learning.foretold import foretold
+from physics3d.learning.foretold import Moving, foretold
 from physics3d.learning.free_body import material_of
-from physics3d.learning.free_motion import FreeMotion, Material, start
+from physics3d.learning.free_motion import Material, start
 from physics3d.learning.identify import Swing, another_take, identified
 from physics3d.learning.seen_modes import observe
 from physics3d.learning.unknown_cause import Swung, by_its_own_camera, first_take, frames_seen, swung
@@ -37,7 +37,6 @@ from physics3d.video import write_mp4
 from physics3d.world import Estimate, World
 
 SEEN, LEARNED, START, IMAGE = "modes as seen", "learned material", "material before", "image modes"
-Moving = FreeMotion | Swing
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,9 +1,10 @@
-"""What a boundary condition is to the solver: numbers, and up to five Warp functions, each at its place in a substep.
+"""What a boundary condition is to the solver: numbers, and up to six Warp functions, each at its place in a substep.
 
     acceleration   added to selected particles before they are scattered           (forces from outside)
     touch          does a particle reach the boundary? `node` then acts only on the nodes of those that do
     node           velocity of a grid node -> velocity of that node                 (walls, colliders)
     grip           how much of a selected particle is gripped now: it moves as imposed, whatever acts on it
+    ahead          how far a place is before the face of what is gripped and stays at rest
     steer          the velocity that is imposed there, and its gradient             (zero: it is held)
 
 The solver calls whatever is there, in the order of the list, and never asks which one it has. A boundary's numbers are

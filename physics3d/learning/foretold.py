@@ -18,11 +18,13 @@ from physics3d.motion.carry import carried, inverse
 
 SMOOTH = 1.5  # of the displacement [px]
 
+Moving = FreeMotion | Swing  # a motion whose amplitudes are known at any time
+
 
 def foretold(
     photograph: UInt8[Tensor, "h w 3"],
     sight: Sight,
-    motion: FreeMotion | Swing,
+    motion: Moving,
     moved: Float[np.ndarray, "h w 2"],
     *,
     last: float,

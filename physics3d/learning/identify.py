@@ -18,13 +18,14 @@ Amplitudes and shapes are linear least squares inside (variable projection, Golu
 another take of the same thing has its own a, b and q_0 alone.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 from scipy import optimize
 
-from physics3d.learning.free_motion import PRIOR, Material, Reduced, modal
+from physics3d.learning.free_motion import FAINT, PRIOR, Material, Reduced, modal
 from physics3d.learning.seen_modes import Observed
 from physics3d.log import Log
 from physics3d.motion.decay import Decay
@@ -32,8 +33,7 @@ from physics3d.motion.decay import Decay
 SPAN = 8  # modes of the model that shapes are made of
 MOST = 4  # oscillations
 ASKED = 0.7  # of the unexplained motion
-FAINT = 0.01  # cost of a motion in space that is not seen, in that of one that is
-SEEN = 1e-4  # the same of shapes that were read off a clip
+SEEN = 1e-4  # what FAINT is for shapes that were read off a clip
 WIDTH = {"slowing": 0.1, "frequency": 0.05, "damping": 1.0}  # of what is likely; the last two in the logarithm
 LEAST_DAMPING = 0.005  # that a refinement starts from, in 2 pi f
 MOST_SLOWING = 0.3
@@ -51,6 +51,7 @@ class Oscillations:
     power: float  # [m^2]
 
     def functions(self, t: Float[np.ndarray, " n"], slowing: float) -> Float[np.ndarray, "j 2 n"]:
+        """Cosine and sine of every oscillation at times t [s], for the `slowing` of one take."""
         return oscillations(self.frequency, self.damping, slowing, t)
 
 
@@ -94,8 +95,7 @@ def identified(body: Reduced, clip: Observed, decay: Decay, *, reference: float 
 
     def solved(f: np.ndarray, d: np.ndarray, slowing: float) -> tuple[np.ndarray, float, float]:
         """(cosine and sine of every oscillation [j, 2, k], what is left, with the cost of what is not seen)."""
-        F = _since(oscillations(f, d, slowing, t), oscillations(f, d, slowing, np.array([reference or 0.0])), reference)
-        F = F.reshape(-1, len(t))
+        F = _since(lambda t: oscillations(f, d, slowing, t), t, reference).reshape(-1, len(t))
         n = len(F) * len(space)
         normal = np.einsum("at,tkl,bt->akbl", F, gram, F, optimize=True).reshape(n, n)
         b = np.einsum("at,tk->ak", F, right).reshape(n)
@@ -162,7 +162,7 @@ def _start(
 ) -> Swing:
     """Least squares for a, b, and q_0 where the flow counts from a picture of another take (`known`)."""
     t = np.arange(len(clip.gram)) / clip.fps
-    F = _since(modes.functions(t, slowing), modes.functions(np.array([reference or 0.0]), slowing), reference)
+    F = _since(lambda t: modes.functions(t, slowing), t, reference)
     count = len(F)
     basis = np.repeat(modes.shape, 2, 1)  # [m, 2 j], each times its function of time
     functions = F.reshape(2 * count, -1)
@@ -189,8 +189,11 @@ def _start(
     )
 
 
-def _since(F: np.ndarray, there: np.ndarray, reference: float | None) -> np.ndarray:
-    return F if reference is None else F - there
+def _since(
+    functions: Callable[[np.ndarray], np.ndarray], t: Float[np.ndarray, " n"], reference: float | None
+) -> Float[np.ndarray, "j 2 n"]:
+    """The functions at times t, less what they are at the time `reference` [s] if there is one."""
+    return functions(t) if reference is None else functions(t) - functions(np.array([reference]))
 
 
 def _power(body: Reduced, swing: Swing) -> float:
