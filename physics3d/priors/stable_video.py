@@ -103,9 +103,14 @@ class StableVideo(AbstractPrior):
             video.permute(0, 3, 1, 2), (self.height, self.width), mode="bilinear", antialias=True, align_corners=False
         )
 
-    def level(self, generator: torch.Generator) -> Level:
+    @property
+    def trained_frames(self) -> int:
+        """As its UNet's configuration says: 14, or 25 of the one that ends in -xt."""
+        return int(self.pipeline.unet.config.num_frames)
+
+    def level(self, share: float) -> Level:
         low, high = (math.log(s) for s in self.sigma)
-        sigma = math.exp(low + (high - low) * float(torch.rand((), generator=generator)))
+        sigma = math.exp(low + (high - low) * share)
         return Level(alpha=1.0, sigma=sigma, time=math.log(sigma) / 4)
 
     def x0_hat(self, z_t: Tensor, level: Level, condition: ImageCondition) -> Tensor:

@@ -150,7 +150,9 @@ def test_frames_that_are_not_equally_far_apart_are_compared_with_the_same_instan
     found = {}
     for at in (stage.spread(clip.takes[0].footage), torch.arange(7)):
         how = dict(image_scale=1.0, device="cpu", log=Log(None))
-        chain = chain_of(stage.world, stage.prior, field, clip, gaussians, body, clip.takes[0], at, **how)
+        chain = chain_of(
+            stage.world, stage.prior, stage.estimator, field, clip, gaussians, body, clip.takes[0], at, **how
+        )
         drawn = chain.render(chain.simulate(field.zero()), 0, torch.arange(7))
         found[tuple(at.tolist())] = drawn
         assert float((drawn - clip.takes[0].videos[0][at].float() / 255).abs().max()) <= 0.5 / 255 + 1e-3
