@@ -20,9 +20,8 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 
 from physics3d.artifact import ArtifactError, decode, encode
-from physics3d.log import METRICS, Log
+from physics3d.log import CHECKPOINT, METRICS, Log
 
-CHECKPOINT = ".checkpoint"
 SHORTEST, LONGEST = 2.0, 25.0  # between two that are written [s]
 SHARE = 0.02  # of the time may go to writing them, unless they get rarer than LONGEST
 ALIVE = 1.0  # how often it is marked that the computation still runs [s]
@@ -36,7 +35,7 @@ class Checkpoint:
         self.log = log
         self.file = None if log.folder is None else log.folder / CHECKPOINT
         self.written = self.marked = time.monotonic()
-        self.wait = SHORTEST
+        self.wait = min(SHORTEST, LONGEST)
         self.failed = False
 
     def load(self, *, curves: bool = True) -> Any:
@@ -92,11 +91,6 @@ class Checkpoint:
                     self.log.warn(f"no checkpoint could be written, and a stop would lose more ({error})")
         self.written = time.monotonic()
         self.wait = min(LONGEST, max(SHORTEST, (self.written - now) / SHARE))
-
-
-def left(folder: Path) -> bool:
-    """Whether a computation that was stopped left a checkpoint in a folder."""
-    return not folder.is_symlink() and (folder / CHECKPOINT).is_file()
 
 
 def _packed(value: Any) -> bytes:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 METRICS, PREVIEWS, LINES = "metrics.jsonl", "previews", "log.txt"
+CHECKPOINT = ".checkpoint"  # while it lasts (`checkpoint.py`)
 LINES_EVERY = 15.0  # between two lines of progress where there is no screen [s]
 
 

@@ -4,7 +4,7 @@ The result is a folder artifacts/<stage>/<fingerprint>/ with the artifact, what 
 (size and sha256 of every file, configuration, time, memory, versions). It is written under a hidden name beside its
 place, flushed to the disk and renamed: whatever kills the run, nothing half-done looks finished. A lock per artifact
 (released by the system when its holder dies) makes a second run wait and then reuse; whoever holds the lock sweeps what
-dead runs left behind.
+dead runs left behind, but for stages that keep checkpoints (`physics3d/checkpoint.py`): these go on from the last one.
 """
 
 import difflib
@@ -154,6 +154,11 @@ def damage(step: Step, verify: bool = False) -> str | None:
     except (OSError, ValueError) as error:
         return str(error) or "unreadable"
     return None
+
+
+def half_done(step: Step) -> bool:
+    """Whether a run would go on from a checkpoint of this step."""
+    return _left(step.folder.with_name(f".{step.fingerprint}"))
 
 
 def spoilt(step: Step, reason: str) -> StageError:
@@ -327,8 +332,7 @@ def strange(step: Step) -> str | None:
 
 
 def _compute(step: Step, device: str, verify: bool) -> dict[str, Any]:
-    from physics3d.checkpoint import CHECKPOINT
-    from physics3d.log import METRICS, Log
+    from physics3d.log import CHECKPOINT, METRICS, Log
 
     temporary = step.folder.with_name(f".{step.fingerprint}")
     try:
@@ -415,11 +419,9 @@ def _lock(step: Step, wait: bool) -> Iterator[bool]:
 
 def _sweep(step: Step) -> None:
     """Remove unfinished folders of this stage whose writers are gone, but for those with a checkpoint to go on from."""
-    from physics3d.checkpoint import left
-
     for folder in (step.shelf / step.stage).glob(".*"):
         key = folder.name[1:]
-        if left(folder):
+        if _left(folder):
             continue
         if key == step.fingerprint:  # we hold its lock
             _remove(folder)
@@ -431,11 +433,16 @@ def _sweep(step: Step) -> None:
                     _remove(folder)
 
 
+def _left(folder: Path) -> bool:
+    """Whether a stage that was stopped left a checkpoint in its unfinished folder."""
+    from physics3d.log import CHECKPOINT
+
+    return not folder.is_symlink() and (folder / CHECKPOINT).is_file()
+
+
 def _drop(temporary: Path) -> None:
     """Remove what a stage has written so far, unless it can go on from there."""
-    from physics3d.checkpoint import left
-
-    if not left(temporary):
+    if not _left(temporary):
         shutil.rmtree(temporary, ignore_errors=True)
 
 

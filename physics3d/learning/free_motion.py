@@ -27,6 +27,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import optimize
 
+from physics3d.journal import Journal
 from physics3d.learning.seen_modes import Observed
 from physics3d.log import Log
 from physics3d.modes import vibration
@@ -228,11 +229,14 @@ def fit(
     at = None if reference is None else (reference - release) / clip.fps
     moved = float(window.square.sum())
 
+    journal = Journal(log)
+
     def cost(theta: np.ndarray) -> float:
         material = Material.of(theta)
         if not np.all(np.abs(theta) < 40):
             return 1e3
-        return start(body, material, window, reference=at)[1] / moved + PRIOR * material.improbability()
+        misfit = lambda: float(start(body, material, window, reference=at)[1]) / moved
+        return journal.ask("misfit", theta.tolist(), answer=misfit) + PRIOR * material.improbability()
 
     nothing = np.zeros(zones)
     square, shape = modal(body, Material(stiffness=0.0, zones=nothing, ratio=0.0, time=0.0))

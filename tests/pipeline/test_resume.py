@@ -13,7 +13,7 @@ import pytest
 import torch
 
 import physics3d.checkpoint
-from physics3d.checkpoint import CHECKPOINT
+from physics3d.log import CHECKPOINT
 from pipeline.shelf import clean, collect
 from pipeline.stage import Filed, Step, load, run
 from pipeline.tracking import Tracking

@@ -170,6 +170,7 @@ class Counting:
     size: int = 0  # of what a checkpoint holds beside the walk [byte]
 
     def __call__(self, *, log: Log) -> Video:
+        log.info("counting")
         generator, checkpoint = torch.Generator().manual_seed(0), Checkpoint(log)
         begin, walk = 0, torch.zeros(4)
         if kept := checkpoint.load():
@@ -189,4 +190,6 @@ class Counting:
                 if how == "kill":
                     os.kill(os.getpid(), signal.SIGKILL)
                 raise KeyboardInterrupt
-        return Video(frames=((255 * walk / self.steps).byte().reshape(1, 2, 2, 1).repeat(1, 1, 1, 3),), fps=1.0)
+        return Video(
+            frames=((255 * walk / self.steps).byte().reshape(1, 2, 2, 1).repeat(1, 1, 1, 3),), fps=1.0, names=("toy",)
+        )

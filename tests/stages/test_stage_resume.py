@@ -1,0 +1,79 @@
+"""Reconstruction and learning, stopped again and again, end with the bits and curves of a run that nobody stopped."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from interrupted import Interrupted
+from small_scene import DAMPED, bar, capture, learner
+from test_stage_reconstruct import QUICK, make_capture
+
+import physics3d.checkpoint
+from physics3d.artifact import AbstractArtifact, encode
+from physics3d.gaussians.adam import Rates
+from physics3d.gaussians.densification.adaptive import Adaptive
+from physics3d.gaussians.densification.relocation import Relocation
+from physics3d.log import CHECKPOINT, METRICS, Log
+
+SHORT = replace(QUICK, iterations=40, check_every=8, densification=Adaptive(every=6))
+FITS = {
+    "adaptive, exposures": replace(SHORT, exposure=True),
+    "relocation, harmonics": replace(SHORT, densification=Relocation(every=6), sh_degree=1),
+    # it ends at the second look after the part in which Gaussians are added: what was best decides
+    "early end": replace(SHORT, iterations=60, patience=2, rates=Rates(mean=1e-6, log_scale=1e-5, sh=1e-5)),
+}
+
+
+def points(folder: Path) -> list[tuple[str, int | None, float]]:
+    lines = map(json.loads, (folder / METRICS).read_text().splitlines())
+    return [(line["name"], line["step"], line["value"]) for line in lines]
+
+
+def assert_unchanged_by_stops(
+    stage: Callable[[Log], AbstractArtifact], folder: Path, stops: tuple[int, ...], often: float
+) -> None:
+    """`stops`: after how many items of its bars each run is interrupted, before one that is not."""
+    straight = stage(Log(folder / "straight", quiet=True))
+    for after in stops:
+        with pytest.raises(KeyboardInterrupt):
+            stage(Interrupted(folder / "stopped", after))
+    assert (folder / "stopped" / CHECKPOINT).is_file()
+    last = Log(folder / "stopped", quiet=True)
+    resumed = stage(last)
+    said = (folder / "stopped" / "log.txt").read_text()
+    assert said.count("resuming") == len(stops) or often > 0
+    (tree, tensors), (same, others) = encode(straight), encode(resumed)
+    assert tree == same and all(torch.equal(tensors[name], others[name]) for name in tensors | others)
+    assert points(folder / "stopped") == points(folder / "straight")
+    shown = [sorted(p.name for p in (folder / which / "previews").glob("*")) for which in ("straight", "stopped")]
+    assert shown[0] == shown[1]
+    for name in shown[0]:
+        one, other = ((folder / which / "previews" / name).read_bytes() for which in ("straight", "stopped"))
+        assert one == other, name
+
+
+@pytest.mark.parametrize("fit", FITS.values(), ids=FITS)
+def test_a_fit_of_gaussians_ends_as_if_it_had_not_been_stopped(tmp_path, monkeypatch, fit):
+    monkeypatch.setattr(physics3d.checkpoint, "LONGEST", 0.0)  # a checkpoint after every step
+    scene = make_capture(matte=True, points=True)
+    # before and after Gaussians are added, between two looks and right after one
+    assert_unchanged_by_stops(lambda log: fit(scene, log=log), tmp_path, (1, 6, 9, 12), often=0.0)
+
+
+def test_what_a_fit_did_after_its_last_checkpoint_is_done_again_and_not_told_twice(tmp_path, monkeypatch):
+    monkeypatch.setattr(physics3d.checkpoint, "LONGEST", 0.15)  # a checkpoint after some of the steps
+    scene = make_capture(matte=False, points=True)
+    fit = replace(SHORT, check_every=2)
+    assert_unchanged_by_stops(lambda log: fit(scene, log=log), tmp_path, (15, 13), often=0.15)
+
+
+def test_learning_ends_as_if_it_had_not_been_stopped(tmp_path, monkeypatch):
+    monkeypatch.setattr(physics3d.checkpoint, "LONGEST", 0.0)
+    clip = capture(DAMPED, frames=4)
+    options = dict(search=3, steps=3, polish=2, frames=4, frames_per_step=3, stay=0.01)
+    stage = learner(DAMPED | {"youngs_modulus": 1.5e4}, ("youngs_modulus", "branch_shear_modulus"), **options)
+    # in the search, the descent and the polish
+    assert_unchanged_by_stops(lambda log: stage(clip, *bar(), log=log), tmp_path, (2, 5, 7), often=0.0)
