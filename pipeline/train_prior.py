@@ -1,6 +1,7 @@
-"""make train-prior [OUT=folder] [ARGS="steps=2000 seed=0 device=cpu"]: a small video model, from films that it makes.
+"""make train-prior [OUT=folder] [ARGS="steps=1500 seed=0 device=cpu"]: a small video model, from films that it makes.
 
-    python -m pipeline.train_prior [steps=2000] [seed=0] [device=cpu|cuda] [precision=float32|bfloat16] [forms=40] [films=48]
+    python -m pipeline.train_prior [steps=1500] [seed=0] [device=cpu|cuda] [precision=float32|bfloat16]
+                                   [forms=32] [films=48]
 
 Films of the family in `physics3d/scenes/stems.py` are made first, `films` of each of `forms` forms; then the network of
 `physics3d/priors/tiny_video.py` is trained on them. Both go on where they were when the same command is given again. In
@@ -15,13 +16,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-USAGE = 'make train-prior [OUT=<folder>] [ARGS="steps=2000 seed=0 device=cpu precision=float32 forms=40 films=48"]'
+USAGE = 'make train-prior [OUT=<folder>] [ARGS="steps=1500 seed=0 device=cpu precision=float32 forms=40 films=48"]'
 DEFAULTS: dict[str, Any] = {
-    "steps": 2000,
+    "steps": 1500,
     "seed": 0,
     "device": "cpu",
     "precision": "float32",
-    "forms": 40,
+    "forms": 32,
     "films": 48,
 }
 UNSEEN_FORMS, UNSEEN_FILMS = 4, 16  # that are kept from the training
@@ -63,9 +64,7 @@ def asked(words: list[str]) -> dict[str, Any]:
     return options
 
 
-def train_prior(
-    out: Path, *, steps: int, seed: int, device: str, precision: str, forms: int, films: int
-) -> None:
+def train_prior(out: Path, *, steps: int, seed: int, device: str, precision: str, forms: int, films: int) -> None:
     """Raises ValueError in one line for options that cannot be, or a folder of another training."""
     import torch
 
@@ -83,9 +82,10 @@ def train_prior(
     network, losses = train(seen, Architecture(frames=FRAMES, size=PIXELS), training, folder=out, log=log)
     network = network.cpu()
     errors = unseen_errors(network, unseen)
-    log.info("error where nothing was trained, in shares of the motion, by sigma/alpha: " + ", ".join(
-        f"{level}: {error:.3f}" for level, error in errors.items()
-    ))
+    log.info(
+        "error where nothing was trained, in shares of the motion, by sigma/alpha: "
+        + ", ".join(f"{level}: {error:.3f}" for level, error in errors.items())
+    )
     loss_curve(losses).savefig(out / "loss.png", dpi=110)
     samples(network, unseen, seed).save(out / "samples.png")
     about = {
@@ -156,7 +156,11 @@ def loss_curve(losses: list[float]) -> Any:
     axis = figure.add_subplot()
     axis.plot(losses, lw=0.5, color="0.7", label="each step")
     width = min(50, len(losses))
-    axis.plot(np.arange(width - 1, len(losses)), np.convolve(losses, np.ones(width) / width, "valid"), label=f"mean of {width}")
+    axis.plot(
+        np.arange(width - 1, len(losses)),
+        np.convolve(losses, np.ones(width) / width, "valid"),
+        label=f"mean of {width}",
+    )
     axis.set(xlabel="step", ylabel="weighted error / motion", yscale="log")
     axis.legend(frameon=False)
     return figure

@@ -90,7 +90,9 @@ class Layer(nn.Module):
         super().__init__()
         self.level = nn.Linear(width, 6 * width)
         self.ask, self.attended = nn.Linear(width, 3 * width), nn.Linear(width, width)
-        self.think = nn.Sequential(nn.Linear(width, 4 * width), nn.GELU(approximate="tanh"), nn.Linear(4 * width, width))
+        self.think = nn.Sequential(
+            nn.Linear(width, 4 * width), nn.GELU(approximate="tanh"), nn.Linear(4 * width, width)
+        )
         nn.init.zeros_(self.level.weight)
         nn.init.zeros_(self.level.bias)
 

@@ -143,5 +143,7 @@ def load(folder: Path) -> SpaceTimeTransformer:
         network.load_state_dict({name: value.float() for name, value in load_file(folder / WEIGHTS).items()})
     except (KeyError, TypeError, RuntimeError, OSError, ValueError) as error:
         what = " ".join(str(error).split())[:200]
-        raise ValueError(f"no weights of tiny_video can be read from {folder}: {what}; make train-prior again") from error
+        raise ValueError(
+            f"no weights of tiny_video can be read from {folder}: {what}; make train-prior again"
+        ) from error
     return network.requires_grad_(False).eval()

@@ -4,9 +4,9 @@
 
 A square stem stands on the ground and carries an ellipsoid; both are one neo-Hookean solid, cut into cubes of half the
 stem's width. Its blossom is poked sideways for a tenth of a second, at the beginning of the film, and the body sways
-freely for the rest of it. Drawn are: the stem's width and height, the blossom's size, flatness and colours, the side and
-the direction of the poke, the speed that it would give the blossom if nothing held it, and the camera. Everything but
-ln E, the poke and its side can be seen in the first frame, so that the frequency of the film tells E.
+freely for the rest of it. Drawn are: the stem's width and height, the blossom's size, flatness and colours, the side
+and the direction of the poke, the speed that it would give the blossom if nothing held it, and the camera. Everything
+but ln E and the poke can be seen in the first frame, so that the frequency of the film tells E.
 
 Films are made in milliseconds from the modes of vibration of one body, in closed form: with R_m the answer of an
 oscillator of frequency omega_m and drag c to the poke,

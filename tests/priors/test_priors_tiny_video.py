@@ -5,12 +5,12 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from pipeline import train_prior
 
 from physics3d.log import Log
 from physics3d.priors.denoising import STATE, Training, codes, ddim, denoising_error, draw, motion, train
 from physics3d.priors.space_time_transformer import Architecture, SpaceTimeTransformer, pictures, tokens
 from physics3d.priors.tiny_video import TinyVideo, level_of, save
+from pipeline import train_prior
 
 SMALL = Architecture(frames=4, size=8, patch=4, width=32, layers=1)
 
@@ -103,7 +103,7 @@ def test_a_step_of_drawing_is_that_of_diffusers():
 
 
 def test_drawing_with_the_exact_denoiser_gives_its_distribution():
-    """Along the flow (z - alpha m)/sqrt(alpha^2 s^2 + sigma^2) stays what it was, so the end is known for every start."""
+    """Along the flow (z - alpha m)/sqrt(alpha^2 s^2 + sigma^2) stays what it was: the end is known for every start."""
     mean, deviation, span = 0.3, 0.5, (0.01, 20.0)
     still = torch.zeros(2, 3, 8, 8)
     start = torch.randn(2, 4, 3, 8, 8, generator=torch.Generator().manual_seed(5))
@@ -207,7 +207,7 @@ def test_a_larger_video_is_brought_to_the_size_of_the_network(prior):
 
 
 def test_sizes_that_it_was_not_trained_on_are_refused(prior):
-    with pytest.raises(ValueError, match="learn.frames=4"):
+    with pytest.raises(ValueError, match=r"learn\.frames=4"):
         prior.encode(torch.zeros(5, 8, 8, 3))
     with pytest.raises(ValueError, match="square"):
         prior.encode(torch.zeros(4, 8, 12, 3))
