@@ -136,12 +136,13 @@ def save(network: SpaceTimeTransformer, folder: Path, about: dict[str, object]) 
 
 def load(folder: Path) -> SpaceTimeTransformer:
     """The network of a folder, frozen, in single precision on the CPU. Raises ValueError if the files do not fit."""
+    from safetensors import SafetensorError
     from safetensors.torch import load_file
 
     try:
         network = SpaceTimeTransformer(Architecture(**json.loads((folder / CONFIG).read_text())["architecture"]))
         network.load_state_dict({name: value.float() for name, value in load_file(folder / WEIGHTS).items()})
-    except (KeyError, TypeError, RuntimeError, OSError, ValueError) as error:
+    except (KeyError, TypeError, RuntimeError, OSError, ValueError, SafetensorError) as error:
         what = " ".join(str(error).split())[:200]
         raise ValueError(
             f"no weights of tiny_video can be read from {folder}: {what}; make train-prior again"
