@@ -24,7 +24,7 @@ from torch.utils.checkpoint import checkpoint
 
 from physics3d.checks import Ascending, Device, NotNegative, Pixels, Positive, Rate, Text, require_fields
 from physics3d.priors.base import AbstractPrior, Level, x0_from
-from physics3d.priors.weights import Precision, load_pipeline, pipeline_files
+from physics3d.priors.weights import Precision, load_pipeline, pipeline_files, pipeline_folder
 
 
 class ImageCondition(NamedTuple):
@@ -105,8 +105,11 @@ class StableVideo(AbstractPrior):
 
     @property
     def trained_frames(self) -> int:
-        """As its UNet's configuration says: 14, or 25 of the one that ends in -xt."""
-        return int(self.pipeline.unet.config.num_frames)
+        """As the configuration beside its weights says: 14, or 25 of the one that ends in -xt."""
+        from diffusers import StableVideoDiffusionPipeline, UNetSpatioTemporalConditionModel
+
+        folder = pipeline_folder(StableVideoDiffusionPipeline, self.model, key="prior.model", variant=self.variant)
+        return int(UNetSpatioTemporalConditionModel.load_config(folder, subfolder="unet")["num_frames"])
 
     def level(self, share: float) -> Level:
         low, high = (math.log(s) for s in self.sigma)
