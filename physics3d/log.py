@@ -67,9 +67,9 @@ class Log:
         target.parent.mkdir(parents=True, exist_ok=True)
         return target
 
-    def progress(self, items: Iterable, description: str, total: int | None = None, done: int = 0) -> Any:
-        """`items` behind a bar with an estimate; call `.set_postfix(loss=...)` on what is returned. `done`: how many of
-        the `total` came before these, in a run that was stopped."""
+    def progress(self, items: Iterable | None, description: str, total: int | None = None, done: int = 0) -> Any:
+        """`items` behind a bar with an estimate; call `.set_postfix(loss=...)` on what is returned. None for items:
+        call `.update()`. `done`: how many of the `total` came before these, in a run that was stopped."""
         from tqdm import tqdm
 
         screen = sys.stderr.isatty()

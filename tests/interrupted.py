@@ -12,8 +12,8 @@ class Interrupted(Log):
         super().__init__(folder, quiet=True)
         self.after = after
 
-    def progress(self, items: Iterable, description: str, total: int | None = None, done: int = 0) -> Any:
-        return super().progress(self._until(items), description, total, done)
+    def progress(self, items: Iterable | None, description: str, total: int | None = None, done: int = 0) -> Any:
+        return super().progress(self._until(items or ()), description, total, done)
 
     def _until(self, items: Iterable):
         for item in items:

@@ -82,7 +82,8 @@ def fit(
     found = {"mean of last quarter": mean}
     if chain.comparable:
         found["best iterate"] = min(course, key=lambda point: point.loss).theta
-    losses = {name: chain.measure(candidate, seed) for name, candidate in found.items()}
+    candidates = log.progress(found.items(), "comparing what was found", total=len(found))
+    losses = {name: chain.measure(candidate, seed) for name, candidate in candidates}
     log.info(
         f"loss over all frames: start {unit:.5g}, {', '.join(f'{name} {loss:.5g}' for name, loss in losses.items())}"
     )

@@ -104,14 +104,15 @@ def _shown(chain: Chain, theta: Tensor, seed: int, step: float) -> dict[str, Any
         scores.append(summed(s))
         shares.append(summed(I))
     push = np.linalg.pinv(JJ[:k, :k], hermitian=True) @ JJ[:k, k] if len(JJ) > k else np.zeros(k)
-    evidence = dict(JJ=JJ[:k, :k], score=np.concatenate(scores, 1), share=np.concatenate(shares, 1))
+    evidence = dict(JJ=JJ[:k, :k].copy(), score=np.concatenate(scores, 1), share=np.concatenate(shares, 1))
     return dict(evidence=evidence, push=push, rms=np.sqrt(squares[:k] / max(count, 1)))
 
 
 def _motions(chain: Chain, theta: Tensor, step: float) -> list[Any]:
     """At theta, and a step beside it in each component."""
+    places = (theta, *(theta + step * torch.eye(len(theta), dtype=theta.dtype)))
     with torch.no_grad():
-        return [chain.simulate(t) for t in (theta, *(theta + step * torch.eye(len(theta), dtype=theta.dtype)))]
+        return [chain.simulate(t) for t in chain.journal.log.progress(places, "looking around")]
 
 
 def _around(chain: Chain, motions: list[Any], seed: int, step: float) -> Iterator[_Seen]:
