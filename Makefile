@@ -33,7 +33,7 @@ export $(words)
 
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup run why sweep pin unpin collect score twin fit-curves export film report ui graph view test newest bench lint \
+.PHONY: help setup run why sweep compare pin unpin collect score twin train-prior fit-curves export film report ui graph view test newest bench lint \
 	handbook configuration architecture clean
 py := .venv/bin/python
 # torch's own threads spin beside those of the renderer and the simulator: OMP_NUM_THREADS=1 unless you say otherwise
@@ -54,7 +54,7 @@ help: ## this list
 	@echo "  SCENE=$$SCENE PROFILE=$$PROFILE METHOD=$$METHOD DATA=$$DATA ARGS=\"$$ARGS\""
 	@echo '  scenes: $(basename $(notdir $(wildcard conf/scene/*.yaml)))'
 
-setup: $(ready) ## .venv with everything in it (5 to 10 minutes, 7 GB, once)
+setup: $(ready) ## .venv with everything in it (5 to 10 minutes, 8.5 GB on disk, once)
 
 $(ready): pyproject.toml setup.py constraints.txt
 	@"$$PYTHON" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -77,6 +77,10 @@ sweep: $(ready) ## many runs at once: SCENES=carnation,ball METHODS=... SEEDS=0,
 	@$(threads) $(with_args) -m pipeline.sweep scenes="$$SCENES" methods="$$METHODS" seeds="$$SEEDS" runner="$$RUNNER" workers="$$WORKERS" \
 		address="$$ADDRESS" profile="$$PROFILE" $${DATA:+data="$$DATA"}
 
+compare: $(ready) ## every method on SCENES=carnation,cake, the paper's table: [METHODS=...] [OUT=<folder>]
+	@$(threads) $(with_args) -m pipeline.compare scenes="$${SCENES:-$$SCENE}" methods="$$METHODS" $${RUNNER:+runner="$$RUNNER"} \
+		$${WORKERS:+workers="$$WORKERS"} $${OUT:+out="$$OUT"} profile="$$PROFILE" $${DATA:+data="$$DATA"}
+
 pin unpin: $(ready) ## keep a result whatever is cleaned or collected: make pin RESULT=learn/<fingerprint>
 	@$(py) -m pipeline.shelf $@ "$$RESULT"
 
@@ -88,6 +92,9 @@ score: $(ready) ## any two videos compared: REAL=<clip> PRED=<clip> [OUT=<folder
 
 twin: $(ready) ## a thing with known material as photographs and clips on disk: OUT=<new folder>
 	@$(threads) $(py) -m pipeline.twin
+
+train-prior: $(ready) ## a small video model from films it makes; goes on where it was: [OUT=outputs/tiny_video] [ARGS="steps=... seed=0 device=cpu"]
+	@$(threads) $(with_args) -m pipeline.train_prior
 
 export: $(ready) ## the moving Gaussians for other programs: FORMAT=ply|usd|gltf [OUT=<new folder>] [FRAME=<of gltf>]
 	@$(threads) $(with_args) -m pipeline.export $(of_run)
@@ -138,5 +145,5 @@ architecture: $(ready) ## draw docs/architecture.png and its table from the impo
 	@$(py) docs/draw_architecture.py
 
 clean: ## remove results and caches (artifacts, MLflow, Prefect), showing their sizes; keeps .venv and pinned results
-	@"$$(test -x $(py) && echo $(py) || echo "$$PYTHON")" -m pipeline.shelf clean artifacts sweeps mlartifacts mlflow.db* .mlflow.lock .prefect \
+	@"$$(test -x $(py) && echo $(py) || echo "$$PYTHON")" -m pipeline.shelf clean artifacts sweeps comparisons mlartifacts mlflow.db* .mlflow.lock .prefect \
 		.warp .pytest_cache .ruff_cache .mypy_cache .hypothesis build *.egg-info

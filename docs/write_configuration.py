@@ -64,6 +64,7 @@ LIMITS = (
 )
 NEEDED = "needed"  # in the place of a default
 LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the same, ten times as fast where libyaml is there
+PARTS = tuple(group for group in GROUPS if group not in ("scene", "material", "method", "profile"))
 TITLES = ("entry", "default", "unit", "may be", "what it is")
 TOP = """# Configuration: every entry
 
@@ -261,10 +262,20 @@ class Page:
             if link := re.fullmatch(r"\$\{([\w.]+)\}", entry.value):
                 self.takers.setdefault(link[1], key)
 
+    def of_a_part(self, key: Key) -> tuple[str, Any]:
+        """(comment, hint) of `prior.blur` and the like, by the first choice that has such an entry."""
+        for path in self.files(key[0]) if key[0] in PARTS else []:
+            for entry in entries(path):
+                if entry.key == key[1:]:
+                    return entry.comment, self.hint(entry.key, kinds(path))
+        return "", Any
+
     def hint(self, key: Key, known: dict[Key, str]) -> Any:
         """What an entry may be; `known`: the classes of its file and of config.yaml."""
         if kind := known.get(key[:-1]):
             return declared(kind).hints.get(key[-1], Any)
+        if key and key[0] in PARTS:
+            return self.of_a_part(key)[1]
         if taker := self.takers.get(".".join(key)):
             return self.hint(taker, kinds(self.main))
         node: Any = PLAIN
@@ -283,6 +294,7 @@ class Page:
             above.comment if above else "",
             remark(kind, entry.key[-1]) if kind else "",
             taker.comment if taker else "",
+            self.of_a_part(entry.key)[0],
             COMMON.get(entry.key[-1], ""),
             f"that of `{link[1]}`" if link else "",
         )
@@ -336,7 +348,7 @@ class Page:
             for path in self.files(group):
                 yield f"| [`{path.stem}`](../conf/{group}/{path.name}) | {cell(described(path))} |"
             yield ""
-        for group in ("prior", "masker", "densification", "solid"):
+        for group in PARTS:
             for path in self.files(group):
                 found = list(entries(path))
                 yield f"### `{group}={path.stem}`\n\n{link(kinds(path)[()])}. Set them as `{group}.<entry>`.\n"

@@ -1,5 +1,5 @@
 """Particles + video prior -> material: score distillation through renderer and simulator
-(`physics3d/learning/fit.py`)."""
+(`physics3d/learning/fit.py`), from a recorded motion, or from an imagined one where the prior needs no recording."""
 
 import dataclasses
 import math
@@ -33,6 +33,7 @@ from physics3d.learning.course import Point, history
 from physics3d.learning.curves import curves
 from physics3d.learning.fields import AXES, GlobalField, physical
 from physics3d.learning.fit import fit
+from physics3d.learning.imagined import Imagined
 from physics3d.learning.interval import Beyond, intervals, is_stiff, posterior, words
 from physics3d.learning.linear import Shown, shown
 from physics3d.learning.loss import Chain
@@ -42,11 +43,14 @@ from physics3d.learning.unknown_cause import learned_free
 from physics3d.log import Log
 from physics3d.pictures import contact_sheet, to_uint8
 from physics3d.priors.base import AbstractPrior
+from physics3d.priors.estimators.base import AbstractEstimator
+from physics3d.priors.estimators.sds import ScoreDistillation
 from physics3d.scenes.base import Capture, Footage, Outline
 from physics3d.world import Estimate, Interval, World
 
 Span = Annotated[float, Gt(1), Le(1e12)]  # a factor
 Width = Annotated[float, Gt(0), Le(20)]
+USUAL_FRAMES = 15  # of a clip, for priors that take any number
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,6 +59,7 @@ class Learn:
 
     world: World
     prior: AbstractPrior
+    estimator: AbstractEstimator = dataclasses.field(default_factory=ScoreDistillation)
     learn: tuple[Text, ...]  # parameters that may change; the others keep the value of world.start
     ties: tuple[
         tuple[Text, ...], ...
@@ -64,7 +69,9 @@ class Learn:
     polish: Whole = 0  # Levenberg steps after the descent; one costs a forward run per parameter and two
     learning_rate: Annotated[float, Gt(0), Le(10)] = 0.1  # first step of theta: 0.1 is ten per cent of a parameter
     duration: Duration | None = None  # only the first part of the take is used [s]; None: all of it
-    frames: Frames = 15  # of the take, spread over the duration
+    # of the take, spread over the duration; None: as many as the prior was trained on, USUAL_FRAMES if it takes any
+    frames: Frames | None = None
+    imagined: Imagined | None = None  # the motion to learn from where none was recorded
     frames_per_step: Whole = 0  # drawn anew for each step, spread over all of them; 0: all (diffusion priors need all)
     views_per_step: Whole = 1  # cameras drawn anew for each step; 0: all; held-out cameras are never used
     image_scale: Annotated[float, Gt(0), Le(16)] = 0.5  # pixels rendered per pixel of the take, along each side
@@ -95,16 +102,21 @@ class Learn:
 
     def fits(self, outline: Outline) -> None:
         """Raise ValueError if a take of this outline is too short, as far as that is known."""
-        for take in outline.takes or ():
-            if take.role == "learn":
-                self.spread(take)
+        recorded = [take for take in outline.takes or () if take.role == "learn"]
+        if not recorded and outline.takes is not None and self.imagined is not None and not self.prior.needs_clip:
+            recorded = [self.imagined.footage]
+        for take in recorded:
+            self.spread(take)
 
     def __call__(self, capture: Capture, gaussians: Gaussians, body: Body, *, log: Log) -> Estimate:
         """Raises ValueError if there is no take to learn from, or a name, frame count or camera does not fit."""
         take = capture.take("learn")
+        if take is None and self.imagined is not None and not self.prior.needs_clip:
+            take = self.imagined.take(capture, gaussians, device=self.device)
         if take is None:
             raise ValueError(
-                f"capture {capture.name} has no take with role learn; leave out the learning, or record a motion"
+                f"capture {capture.name} has no take with role learn; leave out the learning, record a motion, or take "
+                "a prior that needs none"
             )
         if take.excitation is None:
             width = self.guess_widths.get("youngs_modulus", self.guess_width)
@@ -121,6 +133,7 @@ class Learn:
         chain = chain_of(
             self.world,
             self.prior,
+            self.estimator,
             field,
             capture,
             gaussians,
@@ -131,6 +144,9 @@ class Learn:
             device=self.device,
             log=log,
         )
+        trained = self.prior.trained_frames
+        if trained not in (None, len(indices)):
+            log.warn(f"{len(indices)} frames are shown to a prior that was trained on clips of {trained}")
         log.info(
             f"learning {', '.join(field.names)} from take {take.name}: {len(indices)} frames over {seconds:.2f} s, "
             f"{len(chain.clips)} camera(s), {len(body.position)} particles"
@@ -154,25 +170,26 @@ class Learn:
                 log=log,
             )
             course += descent
-        if self.polish:
+        if self.polish and not chain.comparable:
+            log.info("no polish: single losses of this prior and estimator cannot be compared")
+        elif self.polish:
             theta, polished = polish(chain, field, theta, steps=self.polish, stay=self.stay, seed=self.seed, log=log)
             course += polished
-        seen = shown(chain, field, theta, seed=self.seed)
+        seen = shown(chain, field, theta, seed=self.seed) if chain.certain else None
         learned = replace(
             start,
             parameters={name: v.detach().to(torch.float32) for name, v in field.parameters(theta).items()},
             velocity=field.velocity(theta).detach().to(torch.float32),
             history=history(field, course),
-            intervals=self.intervals(field, theta, seen, section, log),
+            intervals=self.intervals(field, theta, seen, section, log) if seen else {},
         )
         self.report(capture, field, learned, seen, log)
         if log.folder is not None:
             if course:
                 log.image("parameters", curves(capture, learned))
-            frames = torch.arange(len(indices))
             with torch.no_grad():
                 view = next(iter(chain.clips))
-                clip = chain.render(chain.simulate(theta), view, frames)
+                clip = chain.render(chain.simulate(theta), view, chain.frames)
             log.image(
                 "reference_above_learned", contact_sheet(to_uint8(torch.cat([chain.clips[view], clip], 1)), columns=5)
             )
@@ -185,15 +202,20 @@ class Learn:
         total = take.frames
         if self.duration is not None:
             total = min(total, math.floor(self.duration * take.fps + 1e-6) + 1)
-        if self.frames > total:
+        count, why = self.frames, ""
+        if count is None:
+            count = self.prior.trained_frames
+            why = " (null: as many as the prior was trained on)" if count else ""
+            count = count or min(USUAL_FRAMES, total)
+        if count > total:
             raise ValueError(
-                f"learn.frames is {self.frames}, but take {take.name} has {total} frames"
+                f"learn.frames is {count}{why}, but take {take.name} has {total} frames"
                 f"{'' if self.duration is None else f' in {self.duration:g} s'}; lower it or raise learn.duration"
             )
-        stride, rest = divmod(total - 1, self.frames - 1)
+        stride, rest = divmod(total - 1, count - 1)
         if rest < stride:
-            return torch.arange(self.frames) * stride
-        return torch.linspace(0, total - 1, self.frames, dtype=torch.float64).round().long()
+            return torch.arange(count) * stride
+        return torch.linspace(0, total - 1, count, dtype=torch.float64).round().long()
 
     def field(self, start: Estimate, *, speed: float) -> GlobalField:
         """What theta means; `speed` [m/s] is the unit of an initial velocity. Raises ValueError as GlobalField does."""
@@ -242,19 +264,23 @@ class Learn:
         )
         return intervals(field, after)
 
-    def report(self, capture: Capture, field: GlobalField, learned: Estimate, seen: Shown, log: Log) -> None:
-        """One line per number: from, to, truth, how visible it is and between what it lies."""
+    def report(self, capture: Capture, field: GlobalField, learned: Estimate, seen: Shown | None, log: Log) -> None:
+        """One line per number: from, to, truth, how visible it is and between what it lies, as far as that is known."""
         before = physical(field, field.zero())
         after = {name: float(value.mean()) for name, value in learned.parameters.items()}
         after |= dict(zip(AXES, learned.velocity.tolist()))
-        for name, rms in zip(field.names, seen.rms):
-            log.metric(f"sensitivity/{name}", 255 * float(rms))
+        for i, name in enumerate(field.names):
+            visible = ""
+            if seen is not None:
+                log.metric(f"sensitivity/{name}", 255 * float(seen.rms[i]))
+                visible = f"; a factor e changes the picture by {255 * float(seen.rms[i]):.2g} of 255"
             for part in name.split("+"):
                 truth = f", truth {capture.truth[part]:.4g}" if part in capture.truth else ""
-                log.info(
-                    f"{part}: {before[part]:.4g} -> {after[part]:.4g}{truth}; a factor e changes the picture by "
-                    f"{255 * float(rms):.2g} of 255"
-                )
+                log.info(f"{part}: {before[part]:.4g} -> {after[part]:.4g}{truth}{visible}")
+        if seen is None:
+            log.info(
+                "no intervals: what a video model holds probable is no recording, and how far it is wrong nobody knows"
+            )
         self.tell(learned.intervals, log)
 
     def tell(self, told: dict[str, Interval], log: Log) -> None:

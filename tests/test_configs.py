@@ -79,12 +79,12 @@ def named(tree: Any, key: str = "") -> Iterator[tuple[str, dict]]:
             yield from named(value, f"{key}.{name}".lstrip("."))
 
 
-@pytest.mark.parametrize("choice", ["", *[f"{g}={n}" for g in GROUPS[2:6] for n in choices(g)]])
+@pytest.mark.parametrize("choice", ["", *[f"{g}={n}" for g in GROUPS[2:7] for n in choices(g)]])
 def test_the_page_shows_every_field_and_the_defaults_it_departs_from(choice):
     """Of the stages, of World and of the classes that the page chooses. What a scene's source, prompts and boundaries
     may be depends on the scene: there a field need not be shown to be set."""
     config, _ = composed((choice,) if choice else ())
-    shown = {key: tree for key, tree in named(config) if key.split(".")[0] in (*STAGES, "world", *GROUPS[2:6])}
+    shown = {key: tree for key, tree in named(config) if key.split(".")[0] in (*STAGES, "world", *GROUPS[2:7])}
     assert {*STAGES, "world"} <= set(shown)
     for key, tree in shown.items():
         if re.search(r"source|material", key):
@@ -129,7 +129,7 @@ def test_fields_read_from_the_source_are_those_of_the_class(path):
     assert found.rules == getattr(kind, "RULES", ()) and found.ranges == getattr(kind, "RANGES", {})
     for name, hint in found.hints.items():
         # classes of the project have stand-ins, and what only tensors are is left out: their text differs
-        if not re.search(r"Abstract|World|Rates|Beyond|Sam2|Prompt|Tensor|Any", f"{true[name]} {hint}"):
+        if not re.search(r"Abstract|World|Rates|Beyond|Imagined|Sam2|Prompt|Tensor|Any", f"{true[name]} {hint}"):
             assert hint == true[name] and get_args(hint) == get_args(true[name]), name
 
 
@@ -139,7 +139,9 @@ def test_fields_read_from_the_source_are_those_of_the_class(path):
 def recommended() -> list[str]:
     """key=value and group=value in README, docs, comments, docstrings and error messages."""
     groups = "|".join((*GROUPS, "device", "seed", "output", "verify"))
-    entries = "|".join((*STAGES, "world", "scene", "material", "prior", "masker", "densification", "solid", "twin"))
+    entries = "|".join(
+        (*STAGES, "world", "scene", "material", "prior", "estimator", "masker", "densification", "solid", "twin")
+    )
     value = r"\[+[\d\w., \[\]-]*\]|[^\s`\"'<{,;)\[]+"
     pattern = rf"(?<![\w.+/])((?:{groups})=[a-z0-9_]+|\+?(?:{entries})(?:\.[a-z_0-9]+)+=(?:{value}))"
     files = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "Makefile", *(ROOT / "docs").rglob("*.md")]
@@ -223,7 +225,7 @@ ZERO_IS_FINE = re.compile(
 )
 ENDLESS = re.compile(r"(shear|bulk)_relaxation_time(_[23])?$")
 NULL_IS_FINE = re.compile(
-    r"(resolution|sheet_thickness|learn\.duration|floaters|variant|simulate\.force|render\.view|world\.(dt|checkpoint_bytes)|"
+    r"(resolution|sheet_thickness|learn\.(duration|frames)|floaters|variant|simulate\.force|render\.view|world\.(dt|checkpoint_bytes)|"
     r"prompts\.\d\.box)$"
 )
 WORD_IS_FINE = re.compile(r"(prompts\.\d\.view|render\.view)$")
@@ -290,7 +292,9 @@ def composed(words: tuple[str, ...]) -> tuple[dict, dict]:
 
 
 SETTINGS = [()]
-SETTINGS += [(f"{g}={n}",) for g in ("scene", "prior", "masker", "densification", "solid") for n in choices(g)]
+SETTINGS += [
+    (f"{g}={n}",) for g in ("scene", "prior", "estimator", "masker", "densification", "solid") for n in choices(g)
+]
 SETTINGS += [(f"material={n}",) for n in choices("material") if n != "parts"]
 SETTINGS += [(f"profile={n}",) for n in choices("profile")] + [(f"method={n}",) for n in choices("method")]
 

@@ -15,6 +15,7 @@ from physics3d.learning.fields import GlobalField
 from physics3d.learning.loss import Chain
 from physics3d.log import Log
 from physics3d.priors.base import AbstractPrior
+from physics3d.priors.estimators.base import AbstractEstimator
 from physics3d.scenes.base import Capture, Take
 from physics3d.solver import motion_of
 from physics3d.world import World
@@ -23,6 +24,7 @@ from physics3d.world import World
 def chain_of(
     world: World,
     prior: AbstractPrior,
+    estimator: AbstractEstimator,
     field: GlobalField,
     capture: Capture,
     gaussians: Gaussians,
@@ -96,7 +98,14 @@ def chain_of(
 
     known = (*world.boundaries, *(take.excitation or ()))
     forced = _stronger(known, 1.0) != known
-    return Chain(simulate=simulate, render=render, clips=clips, prior=prior, pushed=pushed if forced else None)
+    return Chain(
+        simulate=simulate,
+        render=render,
+        clips=clips,
+        prior=prior,
+        estimator=estimator,
+        pushed=pushed if forced else None,
+    )
 
 
 def _stronger(boundaries: tuple[AbstractBoundary, ...], more: float) -> tuple[AbstractBoundary, ...]:

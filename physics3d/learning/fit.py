@@ -36,8 +36,9 @@ def fit(
 ) -> tuple[Float[Tensor, " k"], list[Point]]:
     """Descend from theta. Returns theta and where it was at every step, and at the end.
 
-    What is returned is the mean of the last quarter of the iterates, or the iterate of lowest loss if that is better
-    over all views and frames. Raises ValueError when the gradient stays not finite.
+    What is returned is the mean of the last quarter of the iterates; or, where losses of single steps can be compared,
+    the iterate of lowest loss, if that is better over all views and frames. Raises ValueError when the gradient stays
+    not finite.
     """
     generator = torch.Generator().manual_seed(seed)
     unit = max(chain.measure(field.zero(), seed), 1e-12)
@@ -79,15 +80,17 @@ def fit(
         with torch.no_grad():
             theta.copy_(field.bound(theta))
     mean = torch.stack([point.theta for point in course[-max(1, len(course) // 4) :]]).mean(0)
-    best = min(course, key=lambda point: point.loss).theta
-    losses = [chain.measure(candidate, seed) for candidate in (mean, best)]
+    found = {"mean of last quarter": mean}
+    if chain.comparable:
+        found["best iterate"] = min(course, key=lambda point: point.loss).theta
+    losses = {name: chain.measure(candidate, seed) for name, candidate in found.items()}
     log.info(
-        f"loss over all frames: start {unit:.5g}, mean of last quarter {losses[0]:.5g}, best iterate {losses[1]:.5g}"
+        f"loss over all frames: start {unit:.5g}, {', '.join(f'{name} {loss:.5g}' for name, loss in losses.items())}"
     )
     log.metric("loss_start", unit)
-    log.metric("loss_learned", min(losses))
-    theta = mean if losses[0] <= losses[1] else best
-    return theta, [*course, Point(way="descent", theta=theta, loss=min(losses))]
+    log.metric("loss_learned", min(losses.values()))
+    theta = found[min(losses, key=lambda name: losses[name])]
+    return theta, [*course, Point(way="descent", theta=theta, loss=min(losses.values()))]
 
 
 def some_of(items: list[int], count: int, generator: torch.Generator) -> list[int]:

@@ -1,4 +1,7 @@
-"""The chain around theta, made linear, z0(theta + d) = z0 + J d, and what its pictures say of theta (`Evidence`)."""
+"""The chain around theta, made linear, z0(theta + d) = z0 + J d, and what its pictures say of theta (`Evidence`).
+
+For priors whose estimate does not depend on the noise: z0 - x0_hat is then a residual, as of any fit of a recording.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,6 +15,7 @@ from torch import Tensor
 from physics3d.learning.fields import GlobalField
 from physics3d.learning.loss import Chain
 from physics3d.learning.sandwich import Evidence, blocks, correlation_length
+from physics3d.priors.base import draws
 
 STEP = 0.05  # of theta, in differences
 
@@ -100,20 +104,17 @@ def _motions(chain: Chain, theta: Tensor, step: float) -> list[Any]:
 
 
 def _around(chain: Chain, motions: list[Any], seed: int, step: float) -> Iterator[_Seen]:
-    """Every view of them, always with the same noise."""
-    frames = torch.arange(len(next(iter(chain.clips.values()))))
-    for view, clip in chain.clips.items():
+    """Every view of them."""
+    assert chain.certain, "a diffusion model's answers are no residuals"
+    for view in chain.clips:
         with torch.no_grad():
-            videos = [chain.render(motion, view, frames) for motion in motions]
+            videos = [chain.render(motion, view, chain.frames) for motion in motions]
             codes = [chain.prior.encode(video) for video in videos]
-            generator = torch.Generator().manual_seed(seed)
-            level = chain.prior.level(generator)
-            noise = torch.randn(codes[0].shape, generator=generator).to(codes[0])
-            condition = chain.prior.condition(clip[0], (clip,))
-            estimate = chain.prior.x0_hat(level.alpha * codes[0] + level.sigma * noise, level, condition)
+            draw = draws(chain.prior, codes[0], torch.Generator().manual_seed(seed), levels=1)[0]
+            estimate = chain.prior.estimate(codes[0], draw, chain.condition(view, chain.frames))
             J = torch.stack([(code - codes[0]).flatten() / step for code in codes[1:]], 1).double().cpu()
             r = (codes[0] - estimate).flatten().double().cpu()
-        yield _Seen(videos=videos, J=J, r=r, weight=chain.prior.weight(level))
+        yield _Seen(videos=videos, J=J, r=r, weight=chain.prior.weight(draw.level))
 
 
 def _gradient(chain: Chain, seen: _Seen) -> Float[np.ndarray, "t h w 3"]:

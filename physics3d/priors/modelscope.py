@@ -81,10 +81,14 @@ class ModelScope(AbstractPrior):
         ]
         return torch.cat(codes).float() * vae.config.scaling_factor
 
-    def level(self, generator: torch.Generator) -> Level:
+    @property
+    def trained_frames(self) -> int:
+        return 16
+
+    def level(self, share: float) -> Level:
         schedule = self.pipeline.scheduler.alphas_cumprod
         low, high = (round(t * (len(schedule) - 1)) for t in self.time)
-        index = int(torch.randint(low, high + 1, (), generator=generator))
+        index = min(low + int(share * (high + 1 - low)), high)
         return Level(alpha=math.sqrt(schedule[index]), sigma=math.sqrt(1 - schedule[index]), time=float(index))
 
     def x0_hat(self, z_t: Tensor, level: Level, condition: Tensor) -> Tensor:

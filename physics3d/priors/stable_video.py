@@ -24,7 +24,7 @@ from torch.utils.checkpoint import checkpoint
 
 from physics3d.checks import Ascending, Device, NotNegative, Pixels, Positive, Rate, Text, require_fields
 from physics3d.priors.base import AbstractPrior, Level, x0_from
-from physics3d.priors.weights import Precision, load_pipeline, pipeline_files
+from physics3d.priors.weights import Precision, load_pipeline, pipeline_files, pipeline_folder
 
 
 class ImageCondition(NamedTuple):
@@ -103,9 +103,17 @@ class StableVideo(AbstractPrior):
             video.permute(0, 3, 1, 2), (self.height, self.width), mode="bilinear", antialias=True, align_corners=False
         )
 
-    def level(self, generator: torch.Generator) -> Level:
+    @property
+    def trained_frames(self) -> int:
+        """As the configuration beside its weights says: 14, or 25 of the one that ends in -xt."""
+        from diffusers import StableVideoDiffusionPipeline, UNetSpatioTemporalConditionModel
+
+        folder = pipeline_folder(StableVideoDiffusionPipeline, self.model, key="prior.model", variant=self.variant)
+        return int(UNetSpatioTemporalConditionModel.load_config(folder, subfolder="unet")["num_frames"])
+
+    def level(self, share: float) -> Level:
         low, high = (math.log(s) for s in self.sigma)
-        sigma = math.exp(low + (high - low) * float(torch.rand((), generator=generator)))
+        sigma = math.exp(low + (high - low) * share)
         return Level(alpha=1.0, sigma=sigma, time=math.log(sigma) / 4)
 
     def x0_hat(self, z_t: Tensor, level: Level, condition: ImageCondition) -> Tensor:

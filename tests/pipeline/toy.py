@@ -120,6 +120,8 @@ class Material:
     error: str = ""
     diary: str = ""
     name: str = ""
+    prior: object = None
+    imagined: object = None
 
     def __call__(self, *inputs: object, log: Log) -> Estimate:
         note(self.diary, self.name)
