@@ -21,7 +21,7 @@ TARGET = Path(__file__).resolve().parent.parent / "docs" / "results" / "mlflow.j
 PATIENCE = 180.0  # [s] for MLflow on a busy machine
 DRAWN = 30.0  # [s] for its charts
 # whatever helper has opened at the side
-CLOSE = "document.querySelectorAll('[aria-label=\"Close\"], [aria-label=\"close\"]').forEach(b => b.click())"
+CLOSE = 'document.querySelectorAll(\'[aria-label="Close"], [aria-label="close"]\').forEach(b => b.click())'
 
 
 def main() -> None:
