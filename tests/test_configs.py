@@ -180,6 +180,7 @@ def mentioned() -> list[str]:
 
 
 SCENE_OF = {
+    "start.stem": "carnation_parts",
     "scene.camera_distance": "clip",
     "camera_distance": "photos",
     "prompts.0.view": "photos",
