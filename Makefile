@@ -33,7 +33,7 @@ export $(words)
 
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup run why sweep compare pin unpin collect score twin train-prior fit-curves export film report ui graph view test newest bench lint \
+.PHONY: help setup run why sweep compare pin unpin collect score twin train-prior fit-curves export still film report ui graph view test newest bench lint \
 	handbook configuration architecture clean
 py := .venv/bin/python
 # torch's own threads spin beside those of the renderer and the simulator: OMP_NUM_THREADS=1 unless you say otherwise
@@ -98,6 +98,9 @@ train-prior: $(ready) ## a small video model from films it makes; goes on where 
 
 export: $(ready) ## the moving Gaussians for other programs: FORMAT=ply|usd|gltf [OUT=<new folder>] [FRAME=<of gltf>]
 	@$(threads) $(with_args) -m pipeline.export $(of_run)
+
+still: $(ready) ## the picture to hand to an image-to-video model: [OUT=<new .png>] [SIZE=1024x576]; then capture.clip=<its clip>
+	@$(threads) $(with_args) -m pipeline.still $(of_run)
 
 film: $(ready) ## the motion from a camera that goes round it: [OUT=<new .mp4>] [SIZE=1280x720] [LENGTH=<seconds>]
 	@$(threads) $(with_args) -m pipeline.film $(of_run)
