@@ -177,7 +177,7 @@ class Learn:
             log.info("no field of stiffness: residuals tell whether a clip asks for one, and this prior has none")
         elif self.nodes and seen is not None:
             finer = StiffnessField(whole=whole, weights=trilinear(body.position, self.nodes))
-            over, more = chained(finer, Log(None)), finer.zero()
+            over, more = replace(chained(finer, Log(None)), journal=chain.journal), finer.zero()
             more[: len(theta)] = theta
             more, descent = self.descended(over, finer, more, log)
             if self.polish and over.comparable:

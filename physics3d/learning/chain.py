@@ -11,6 +11,7 @@ from physics3d.boundaries.impulse import Impulse
 from physics3d.filling.body import Body
 from physics3d.gaussians.deform import Backdrop, render_deformed
 from physics3d.gaussians.model import Gaussians
+from physics3d.journal import Journal
 from physics3d.learning.fields import AbstractField
 from physics3d.learning.loss import Chain
 from physics3d.log import Log
@@ -105,6 +106,7 @@ def chain_of(
         prior=prior,
         estimator=estimator,
         pushed=pushed if forced else None,
+        journal=Journal(log),
     )
 
 
