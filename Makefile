@@ -34,7 +34,7 @@ export $(words)
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .PHONY: help setup run why sweep pin unpin collect score twin fit-curves export film report ui graph view test newest bench lint \
-	handbook architecture clean
+	handbook scenes architecture clean
 py := .venv/bin/python
 # torch's own threads spin beside those of the renderer and the simulator: OMP_NUM_THREADS=1 unless you say otherwise
 threads := OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1}
@@ -130,6 +130,9 @@ lint: $(ready) ## style and types
 
 handbook: $(ready) ## write docs/handbook.md from conf/handbook.yaml
 	@PYTHONPATH=. $(py) docs/write_handbook.py
+
+scenes: $(ready) ## draw docs/scenes/*.jpg, a picture of each scene that is composed of shapes
+	@PYTHONPATH=. $(threads) $(py) docs/draw_scenes.py
 
 architecture: $(ready) ## draw docs/architecture.png and its table from the imports
 	@$(py) docs/draw_architecture.py
