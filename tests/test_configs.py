@@ -176,6 +176,9 @@ def mentioned() -> list[str]:
 
 
 SCENE_OF = {
+    "source.name": "lego",
+    "source.scale": "lego",
+    "source.world": "jelly",
     "scene.camera_distance": "clip",
     "camera_distance": "photos",
     "prompts.0.view": "photos",
