@@ -32,9 +32,11 @@ def draw(twin, dx: float, file: Path) -> None:
 
     from physics3d.log import Log
 
+    # the turns of a coil would touch on a coarser grid
+    coiled = any(getattr(shape, "coil", 0) for shape in twin.moving.values())
     quick = replace(
         twin,
-        world=replace(twin.world, dx=2 * dx),
+        world=replace(twin.world, dx=dx if coiled else 2 * dx),
         evaluate=(),
         views=1,
         held_out_every=0,
