@@ -16,7 +16,7 @@ import os
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import torch
 from jaxtyping import Float, UInt8
@@ -35,13 +35,12 @@ LARGEST_GRADIENT = 1.0
 class Training:
     """How long, how fast, where."""
 
-    steps: Count = 2000
+    steps: Count = 800
     batch: Count = 16
-    learning_rate: Positive = 1e-3
+    learning_rate: Positive = 1.5e-3
     warm_up: Whole = 50  # steps
     average: Count = 100  # steps over which weights are averaged, at the end
     ratio: Annotated[tuple[Positive, Positive], Ascending()] = (1.0, 60.0)  # sigma/alpha
-    precision: Literal["float32", "bfloat16"] = "float32"  # of products of matrices
     seed: Seed = 0
     device: Device = "cpu"
 
@@ -114,8 +113,7 @@ class _Run:
         for group in self.adam.param_groups:
             group["lr"] = options.learning_rate * warm * 0.5 * (1 + math.cos(math.pi * step / options.steps))
         self.adam.zero_grad()
-        with torch.autocast(options.device.split(":")[0], torch.bfloat16, enabled=options.precision == "bfloat16"):
-            loss = (denoising_error(self.network, z0, ratio, noise) * weight(ratio)).mean() / self.scale
+        loss = (denoising_error(self.network, z0, ratio, noise) * weight(ratio)).mean() / self.scale
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), LARGEST_GRADIENT)
         self.adam.step()
