@@ -33,7 +33,7 @@ export $(words)
 
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup run why sweep pin unpin collect score twin train-prior fit-curves export film report ui graph view test newest bench lint \
+.PHONY: help setup run why sweep compare pin unpin collect score twin train-prior fit-curves export film report ui graph view test newest bench lint \
 	handbook architecture clean
 py := .venv/bin/python
 # torch's own threads spin beside those of the renderer and the simulator: OMP_NUM_THREADS=1 unless you say otherwise
@@ -76,6 +76,10 @@ why: $(ready) ## which stages `make run` would compute, and what has changed; ru
 sweep: $(ready) ## many runs at once: SCENES=carnation,ball METHODS=... SEEDS=0,1 RUNNER=thread|process|dask WORKERS=2 [ADDRESS=tcp://...]
 	@$(threads) $(with_args) -m pipeline.sweep scenes="$$SCENES" methods="$$METHODS" seeds="$$SEEDS" runner="$$RUNNER" workers="$$WORKERS" \
 		address="$$ADDRESS" profile="$$PROFILE" $${DATA:+data="$$DATA"}
+
+compare: $(ready) ## every method on SCENES=carnation,cake, the paper's table: [METHODS=...] [OUT=<folder>]
+	@$(threads) $(with_args) -m pipeline.compare scenes="$${SCENES:-$$SCENE}" methods="$$METHODS" $${RUNNER:+runner="$$RUNNER"} \
+		$${WORKERS:+workers="$$WORKERS"} $${OUT:+out="$$OUT"} profile="$$PROFILE" $${DATA:+data="$$DATA"}
 
 pin unpin: $(ready) ## keep a result whatever is cleaned or collected: make pin RESULT=learn/<fingerprint>
 	@$(py) -m pipeline.shelf $@ "$$RESULT"
@@ -138,5 +142,5 @@ architecture: $(ready) ## draw docs/architecture.png and its table from the impo
 	@$(py) docs/draw_architecture.py
 
 clean: ## remove results and caches (artifacts, MLflow, Prefect), showing their sizes; keeps .venv and pinned results
-	@"$$(test -x $(py) && echo $(py) || echo "$$PYTHON")" -m pipeline.shelf clean artifacts sweeps mlartifacts mlflow.db* .mlflow.lock .prefect \
+	@"$$(test -x $(py) && echo $(py) || echo "$$PYTHON")" -m pipeline.shelf clean artifacts sweeps comparisons mlartifacts mlflow.db* .mlflow.lock .prefect \
 		.warp .pytest_cache .ruff_cache .mypy_cache .hypothesis build *.egg-info

@@ -19,21 +19,22 @@ import csv
 import math
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+
+from physics3d.log import Log
+from physics3d.modes.rollout import Solver
+from physics3d.priors.base import AbstractPrior
 from physics3d.priors.distillation import denoising_loss, distillation_loss, still_code
 from physics3d.priors.estimators.base import AbstractEstimator
 from physics3d.priors.estimators.moving_minus_still import MovingMinusStill
 from physics3d.priors.estimators.sds import ScoreDistillation
 from physics3d.priors.estimators.stratified import Stratified
-
-from physics3d.log import Log
-from physics3d.modes.rollout import Solver
 from physics3d.priors.tiny_video import TinyVideo
 from physics3d.scenes.stems import FPS, FRAMES, MODE, SPEED, Look, Poke, Stem, Swaying, film
 
@@ -98,14 +99,17 @@ class Twin:
         return film(self.stem, self.look, moved.position.double(), moved.deformation.double())
 
 
-def landscape(weights: str | None, twins: list[Twin], draws: int) -> list[Row]:
+# a twin and a range of noise -> a prior of that range and what it is told
+PriorOf = Callable[[Twin, tuple[float, float]], tuple[AbstractPrior, Any]]
+
+
+def landscape(twins: list[Twin], draws: int, prior_of: PriorOf) -> list[Row]:
     """The valley of the denoising loss of each twin and range: where it is lowest, and what lies above it."""
     rows, repeats = [], max(1, draws // 8)
     for twin in twins:
         clips = [twin.clip(theta).detach() for theta in GRID]
         for span in RANGES:
-            prior = TinyVideo(weights=weights, ratio=span)
-            condition = prior.condition(clips[0][0], ())
+            prior, condition = prior_of(twin, span)
             loss = np.zeros(len(GRID))
             for k in range(repeats):
                 loss += [
@@ -133,18 +137,17 @@ def landscape(weights: str | None, twins: list[Twin], draws: int) -> list[Row]:
     return rows
 
 
-def gradients(weights: str | None, twins: list[Twin], draws: int) -> Iterator[Row]:
+def gradients(twins: list[Twin], draws: int, prior_of: PriorOf) -> Iterator[Row]:
     """dL/dtheta of single draws along the grid: mean, zero, spread, time."""
     for twin in twins:
-        prior = TinyVideo(weights=weights)
+        prior, _ = prior_of(twin, RANGES[0])
         code = lambda theta, twin=twin, prior=prior: prior.encode(twin.clip(theta).detach())
         at = GRID[::2]
         z = [code(theta) for theta in at]
         slope = [(code(theta + STEP) - code(theta - STEP)) / (2 * STEP) for theta in at]
+        s0 = still_code(prior, twin.clip(0.0).detach())
         for span in RANGES:
-            prior = TinyVideo(weights=weights, ratio=span)
-            still = twin.clip(0.0).detach()[:1].expand(FRAMES, -1, -1, -1)
-            condition, s0 = prior.condition(still[0], ()), still_code(prior, still)
+            prior, condition = prior_of(twin, span)
             for name, estimator in ESTIMATORS.items():
                 # a stratified draw is eight: as much work for each
                 count = draws if name in ("sds", "moving_minus_still") else max(3, draws // 8)
@@ -167,6 +170,16 @@ def gradients(weights: str | None, twins: list[Twin], draws: int) -> Iterator[Ro
                     seconds=seconds,
                     **read_gradient(at, found),
                 )
+
+
+def tiny(weights: str | None) -> PriorOf:
+    """The small video model, told the first picture of the twin."""
+
+    def prior_of(twin: Twin, span: tuple[float, float]) -> tuple[AbstractPrior, Any]:
+        prior = TinyVideo(weights=weights, ratio=span)
+        return prior, prior.condition(twin.clip(0.0).detach()[0], ())
+
+    return prior_of
 
 
 def read_gradient(theta: np.ndarray, found: np.ndarray) -> Row:
@@ -201,16 +214,21 @@ def read_gradient(theta: np.ndarray, found: np.ndarray) -> Row:
 
 
 def distil(
-    weights: str | None, twins: list[Twin], steps: int, *, chosen: list[tuple[str, tuple[float, float]]], by: str
+    twins: list[Twin],
+    steps: int,
+    prior_of: PriorOf,
+    *,
+    chosen: list[tuple[str, tuple[float, float]]],
+    by: str,
 ) -> Iterator[Row]:
     """Adam from a factor 4 above and below; `by` is "closed form" or "solver"."""
     for name, span in chosen:
-        prior = TinyVideo(weights=weights, ratio=span)
         for twin in twins:
+            prior, condition = prior_of(twin, span)
             solver = twin.solver() if by == "solver" else None
             for start in (-FAR, FAR):
                 begin = time.monotonic(), time.process_time()
-                course = descend(prior, ESTIMATORS[name], twin, solver, start, steps)
+                course = descend(prior, condition, ESTIMATORS[name], twin, solver, start, steps)
                 theta = float(np.mean(course[-max(1, steps // 4) :]))
                 yield dict(
                     section="distil",
@@ -229,7 +247,13 @@ def distil(
 
 
 def descend(
-    prior: TinyVideo, estimator: AbstractEstimator, twin: Twin, solver: Solver | None, start: float, steps: int
+    prior: AbstractPrior,
+    condition: Any,
+    estimator: AbstractEstimator,
+    twin: Twin,
+    solver: Solver | None,
+    start: float,
+    steps: int,
 ) -> list[float]:
     """theta at every step."""
     theta = torch.tensor(start, dtype=torch.float64, requires_grad=True)
@@ -240,7 +264,6 @@ def descend(
         adam.param_groups[0]["lr"] = 0.15 * (0.55 + 0.45 * math.cos(math.pi * step / steps))
         clip = twin.clip(theta) if solver is None else twin.solved(solver, theta)
         adam.zero_grad()
-        condition = prior.condition(clip[0].detach(), ())
         distillation_loss(prior, estimator, clip, condition, generator=generator).backward()
         adam.step()
         with torch.no_grad():
@@ -300,14 +323,16 @@ def rows_of(options: dict[str, str]) -> list[Row]:
             print({k: (round(v, 3) if isinstance(v, float) else v) for k, v in row.items() if k != "curve"}, flush=True)
             rows.append(row)
 
+    prior_of = tiny(weights)
     if "landscape" in sections:
-        told(landscape(weights, twins, draws))
+        told(landscape(twins, draws, prior_of))
     if "gradient" in sections:
-        told(gradients(weights, twins, draws))
+        told(gradients(twins, draws, prior_of))
     if "distil" in sections:
-        told(distil(weights, twins[:1], steps, chosen=[(name, RANGES[1]) for name in ESTIMATORS], by="closed form"))
+        every = [(name, RANGES[1]) for name in ESTIMATORS]
+        told(distil(twins[:1], steps, prior_of, chosen=every, by="closed form"))
     if "must" in sections:
-        told(distil(weights, twins, steps, chosen=[best], by="solver"))
+        told(distil(twins, steps, prior_of, chosen=[best], by="solver"))
     return rows
 
 

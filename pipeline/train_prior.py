@@ -86,7 +86,7 @@ def train_prior(out: Path, *, steps: int, seed: int, device: str, forms: int, fi
     )
     loss_curve(losses).savefig(out / "loss.png", dpi=110)
     samples(network, unseen, seed).save(out / "samples.png")
-    about = {
+    about: dict[str, object] = {
         "knows": {
             "bodies": "physics3d/scenes/stems.py",
             "youngs_modulus_median": MODE,
