@@ -35,7 +35,7 @@ LARGEST_GRADIENT = 1.0
 class Training:
     """How long, how fast, where."""
 
-    steps: Count = 800
+    steps: Count = 500
     batch: Count = 16
     learning_rate: Positive = 1.5e-3
     warm_up: Whole = 50  # steps

@@ -53,7 +53,7 @@ def test_an_oscillator_under_a_poke_is_that_of_numerical_integration():
 
 def test_the_derivative_after_the_modulus_is_that_of_differences(swaying):
     poke = Poke(speed=0.1, azimuth=0.0)
-    assert 0.9 < float(swaying.omega[0]) / (2 * math.pi) < 2.5  # about one period in the film [Hz]
+    assert 0.9 < float(swaying.omega[0]) / (2 * math.pi) < 2.5  # about half a period in the film [Hz]
     E = torch.tensor(MODE, dtype=torch.float64, requires_grad=True)
     (slope,) = torch.autograd.grad(swaying.move(FORM, poke, modulus=E)[0][-1, -1, 0], E)
     h = 1e-4 * MODE
