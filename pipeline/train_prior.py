@@ -1,6 +1,6 @@
-"""make train-prior [OUT=folder] [ARGS="steps=500 seed=0 device=cpu"]: a small video model, from films that it makes.
+"""make train-prior [OUT=folder] [ARGS="steps=2000 seed=0 device=cpu"]: a small video model, from films that it makes.
 
-    python -m pipeline.train_prior [steps=500] [seed=0] [device=cpu|cuda] [forms=24] [films=40]
+    python -m pipeline.train_prior [steps=2000] [seed=0] [device=cpu|cuda] [forms=40] [films=40]
 
 Films of the family in `physics3d/scenes/stems.py` are made first, `films` of each of `forms` forms; then the network of
 `physics3d/priors/tiny_video.py` is trained on them. Both go on where they were when the same command is given again. In
@@ -15,12 +15,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-USAGE = 'make train-prior [OUT=<folder>] [ARGS="steps=500 seed=0 device=cpu forms=40 films=48"]'
+USAGE = 'make train-prior [OUT=<folder>] [ARGS="steps=2000 seed=0 device=cpu forms=40 films=40"]'
 DEFAULTS: dict[str, Any] = {
-    "steps": 500,
+    "steps": 2000,
     "seed": 0,
     "device": "cpu",
-    "forms": 24,
+    "forms": 40,
     "films": 40,
 }
 UNSEEN_FORMS, UNSEEN_FILMS = 4, 16  # that are kept from the training

@@ -42,8 +42,8 @@ MODE, SPREAD = 1.0e6, 0.35  # of Young's modulus [Pa]: median, standard deviatio
 DENSITY, POISSON, DRAG = 300.0, 0.3, 1.0  # [kg/m^3], 1, [1/s]
 SPEED, SPEED_SPREAD = 0.30, 0.15  # that a poke would give a free blossom [m/s]: median, deviation of the logarithm
 PUSH = 0.04  # how long it lasts [s]
-# of a film, square: 0.3 s, about half a period, so that films differ the more the more their frequencies do, up to twice;
-# over a whole period a film of twice the frequency is nearer to the right one than one of 1.7 times
+# of a film, square: 0.3 s, about half a period, so that two films differ the more, the more their frequencies do, up to
+# twice; over a whole period a film of twice the frequency is nearer to the right one than one of 1.7 times
 FRAMES, FPS, PIXELS = 16, 50.0, 32
 WIDTH = 0.018  # of the stem of a body of size 1 [m]
 MODES, POINTS = 6, 80  # of vibration, of integration: a stem bends in few ways
