@@ -13,7 +13,7 @@ from pipeline.stage import build
 
 FOLDER = Path(__file__).resolve().parent / "scenes"
 WIDTH, HEIGHT = 256, 192  # of one of the two pictures [px]
-SECONDS, FPS = 0.5, 30.0
+FRAMES, FPS = 7, 20.0
 
 
 def main() -> None:
@@ -31,24 +31,32 @@ def draw(twin, dx: float, file: Path) -> None:
     from PIL import Image
 
     from physics3d.log import Log
+    from physics3d.mpm.rollout import rollout
+    from physics3d.scenes.room import DAYLIGHT, room, witness
+    from physics3d.scenes.studio import Studio
+    from physics3d.scenes.synthetic import Carrier
 
     # the turns of a coil would touch on a coarser grid
     coiled = any(getattr(shape, "coil", 0) for shape in twin.moving.values())
-    quick = replace(
-        twin,
-        world=replace(twin.world, dx=dx if coiled else 2 * dx),
-        evaluate=(),
-        views=1,
-        held_out_every=0,
-        width=WIDTH,
-        height=HEIGHT,
-        frames=1 + round(SECONDS * FPS),
-        fps=FPS,
+    world = replace(twin.world, dx=dx if coiled else 2 * dx)
+    position, volume = replace(twin, world=world).matter()
+    trajectory = rollout(
+        world,
+        world.estimate().parameters,
+        torch.from_numpy(position),
+        torch.from_numpy(volume),
+        excitation=twin.learn,
+        frames=FRAMES,
+        frame_dt=1 / FPS,
+        log=Log(None),
     )
-    (video,) = quick(log=Log(None)).take("learn").videos
-    change = (video.int() - video[:1].int()).abs().flatten(1).sum(1)
-    pair = torch.cat([video[0], video[int(change.argmax())]], 1)
-    Image.fromarray(pair.numpy()).save(file, quality=82, optimize=True)
+    farthest = int((trajectory.position - trajectory.position[0]).norm(dim=2).mean(1).argmax())
+    studio = Studio([*twin.meshes(), *room()], DAYLIGHT, openness_rays=16, seed=0)
+    camera = witness(WIDTH, HEIGHT, target=twin.target, distance=twin.distance, opening=twin.opening)
+    carrier = Carrier(studio.rest(), studio.anchors(), position, world.dx)
+    moved = carrier(trajectory.position[farthest].numpy(), trajectory.deformation[farthest].numpy())
+    pair = [pose.photograph(camera)[0] for pose in (studio.pose(), studio.pose(moved))]
+    Image.fromarray(torch.cat(pair, 1).numpy()).save(file, quality=82, optimize=True)
     print(f"{file.relative_to(FOLDER.parent.parent)}   {file.stat().st_size / 1e3:.0f} kB")
 
 

@@ -33,7 +33,7 @@ from physics3d.scenes import room
 from physics3d.scenes.base import AbstractSource, Capture, Outline
 from physics3d.scenes.flower import SOIL, blossom_centre, plant, surroundings
 from physics3d.scenes.photographs import triple
-from physics3d.scenes.studio import Light, Studio
+from physics3d.scenes.studio import Studio
 from physics3d.scenes.synthetic import captured, outlined, particles
 from physics3d.world import World
 
@@ -75,8 +75,7 @@ class CarnationTwin(AbstractSource):
     def __call__(self, *, log) -> Capture:
         require_fields(self, "source")
         meshes, solids = plant(self.seed)
-        light = Light(backdrop=(0.80, 0.83, 0.86))
-        studio = Studio([*meshes, *surroundings(self.seed)], light, openness_rays=24, seed=self.seed)
+        studio = Studio([*meshes, *surroundings(self.seed)], room.DAYLIGHT, openness_rays=24, seed=self.seed)
         centre = blossom_centre()
         pokes = {
             role: (Impulse(force=triple("force", force), centre=centre, radius=0.05, start=0.0, duration=self.push),)

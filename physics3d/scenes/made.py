@@ -31,9 +31,9 @@ from physics3d.checks import (
     require_fields,
 )
 from physics3d.scenes.base import AbstractSource, Capture, Outline
-from physics3d.scenes.room import photographers, room, witness
+from physics3d.scenes.room import DAYLIGHT, photographers, room, witness
 from physics3d.scenes.shapes import AbstractShape, Place, Sheet
-from physics3d.scenes.studio import Light, Mesh, Studio
+from physics3d.scenes.studio import Mesh, Studio
 from physics3d.scenes.synthetic import captured, outlined, particles, within
 from physics3d.world import World
 
@@ -77,14 +77,18 @@ class MadeTwin(AbstractSource):
 
     def __call__(self, *, log) -> Capture:
         self.check()
+<<<<<<< HEAD
         light = Light(backdrop=(0.80, 0.83, 0.86))
         seen: Any = dict(target=self.target, distance=self.distance, opening=self.opening)
+=======
+        seen = dict(target=self.target, distance=self.distance, opening=self.opening)
+>>>>>>> things
         return captured(
             name=self.name,
             world=self.world,
             pokes={"learn": self.learn, "evaluate": self.evaluate},
             matter=self.matter(),
-            studio=Studio([*self.meshes(), *room()], light, openness_rays=24, seed=self.seed),
+            studio=Studio([*self.meshes(), *room()], DAYLIGHT, openness_rays=24, seed=self.seed),
             cameras=photographers(self.views, self.width, self.height, **seen),
             witness=witness(self.width, self.height, **seen),
             frames=self.frames,

@@ -6,8 +6,9 @@ Everything here stands still. Metres, z up.
 import numpy as np
 
 from physics3d.gaussians.cameras import Camera
-from physics3d.scenes.studio import Mesh, ring, surface_grid, to_linear
+from physics3d.scenes.studio import Light, Mesh, ring, surface_grid, to_linear
 
+DAYLIGHT = Light(backdrop=(0.80, 0.83, 0.86))
 RINGS = ((14.0, 0.45), (32.0, 0.35), (58.0, 0.20))  # elevation of the cameras [deg], share of the views
 
 
