@@ -12,7 +12,7 @@ from physics3d.filling.body import Body
 from physics3d.gaussians.deform import Backdrop, render_deformed
 from physics3d.gaussians.model import Gaussians
 from physics3d.journal import Journal
-from physics3d.learning.fields import GlobalField
+from physics3d.learning.fields import AbstractField
 from physics3d.learning.loss import Chain
 from physics3d.log import Log
 from physics3d.priors.base import AbstractPrior
@@ -26,7 +26,7 @@ def chain_of(
     world: World,
     prior: AbstractPrior,
     estimator: AbstractEstimator,
-    field: GlobalField,
+    field: AbstractField,
     capture: Capture,
     gaussians: Gaussians,
     body: Body,

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from physics3d.learning.course import Point
-from physics3d.learning.fields import GlobalField, physical
+from physics3d.learning.fields import AbstractField, physical
 from physics3d.learning.loss import Chain
 from physics3d.log import Log
 
@@ -22,7 +22,7 @@ MOST_RETREATS = 3  # steps in a row with a gradient that is not finite, before g
 
 def fit(
     chain: Chain,
-    field: GlobalField,
+    field: AbstractField,
     theta: Float[Tensor, " k"],
     *,
     steps: int,

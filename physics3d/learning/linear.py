@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from physics3d.learning.fields import GlobalField
+from physics3d.learning.fields import AbstractField
 from physics3d.learning.loss import Chain
 from physics3d.learning.sandwich import Evidence, blocks, correlation_length
 from physics3d.priors.base import draws
@@ -38,7 +38,7 @@ class _Seen:
     weight: float  # w
 
 
-def linearise(chain: Chain, field: GlobalField, theta: Tensor, *, seed: int, step: float = STEP) -> Linear:
+def linearise(chain: Chain, field: AbstractField, theta: Tensor, *, seed: int, step: float = STEP) -> Linear:
     """J by forward differences in theta: k + 1 simulations, none of them differentiated."""
     made = lambda: _linearised(chain, theta, seed, step)
     return Linear(*chain.journal.ask("linearise", theta, seed, step, answer=made))
@@ -62,7 +62,7 @@ class Shown:
     rms: Float[np.ndarray, " k"]  # change of the code per unit of theta, colour in 0..1
 
 
-def shown(chain: Chain, field: GlobalField, theta: Tensor, *, seed: int, step: float = STEP) -> Shown:
+def shown(chain: Chain, field: AbstractField, theta: Tensor, *, seed: int, step: float = STEP) -> Shown:
     """k + 1 simulations, and one more where a known force drives the motion.
 
     Scores are counted where the pictures are: s(x) = g(x) dvideo(x)/dtheta with g the gradient of the SDS loss by the
