@@ -100,6 +100,11 @@ class Step:
     def folder(self) -> Path:
         return self.shelf / self.stage / self.fingerprint
 
+    @property
+    def unfinished(self) -> Path:
+        """Where the artifact is written until it is whole."""
+        return self.folder.with_name(f".{self.fingerprint}")
+
     def part(self, field: str) -> "Part":
         return Part(self, field)
 
@@ -158,7 +163,7 @@ def damage(step: Step, verify: bool = False) -> str | None:
 
 def half_done(step: Step) -> bool:
     """Whether a run would go on from a checkpoint of this step."""
-    return _left(step.folder.with_name(f".{step.fingerprint}"))
+    return _left(step.unfinished)
 
 
 def spoilt(step: Step, reason: str) -> StageError:
@@ -332,12 +337,14 @@ def strange(step: Step) -> str | None:
 
 
 def _compute(step: Step, device: str, verify: bool) -> dict[str, Any]:
-    from physics3d.log import CHECKPOINT, METRICS, Log
+    from physics3d.log import CHECKPOINT, LINES, PREVIEWS, Log
 
-    temporary = step.folder.with_name(f".{step.fingerprint}")
+    temporary = step.unfinished
     try:
         temporary.mkdir(parents=True, exist_ok=True)
-        (temporary / METRICS).unlink(missing_ok=True)  # a checkpoint has its curves
+        for path in temporary.iterdir():  # a checkpoint has the curves; what else was left is written anew
+            if path.name not in (CHECKPOINT, LINES, PREVIEWS):
+                _remove(path)
         log = Log(temporary, name=step.name)
         stage = build(step.config, device, step.name)
         inputs = [load(source, device, verify) for source in step.inputs]

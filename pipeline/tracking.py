@@ -100,7 +100,7 @@ class Tracking:
 
     def _begin(self, step: Step) -> None:
         self.live = Live(self.client, self._nested(step))
-        self.live.follow(step.folder.with_name(f".{step.fingerprint}"))
+        self.live.follow(step.unfinished)
 
     def _nested(self, step: Step) -> str:
         tags = {

@@ -15,7 +15,7 @@ import torch
 import physics3d.checkpoint
 from physics3d.log import CHECKPOINT
 from pipeline.shelf import clean, collect
-from pipeline.stage import Filed, Step, load, run
+from pipeline.stage import Filed, Step, damage, half_done, load, run
 from pipeline.tracking import Tracking
 
 HERE = Path(__file__).resolve().parent
@@ -43,6 +43,7 @@ def stopped(folder: Path, at: int, **changes: int) -> Step:
     step = counting(folder, **changes)
     with pytest.raises(KeyboardInterrupt):
         run(step, "cpu")
+    assert half_done(step), "as `make why` says"
     return step
 
 
@@ -52,7 +53,7 @@ def diary(folder: Path) -> list[int]:
 
 
 def left(step: Step) -> Path:
-    return step.folder.with_name(f".{step.fingerprint}") / CHECKPOINT
+    return step.unfinished / CHECKPOINT
 
 
 def assert_right(filed: Filed, tmp_path: Path) -> None:
@@ -62,7 +63,7 @@ def assert_right(filed: Filed, tmp_path: Path) -> None:
     assert torch.equal(load(filed.step, "cpu").frames[0], load(whole, "cpu").frames[0])
     assert {p.name for p in filed.step.folder.rglob("*")} == {p.name for p in whole.folder.rglob("*")}
     assert (filed.step.folder / "metrics.jsonl").read_text() == (whole.folder / "metrics.jsonl").read_text()
-    assert not list(filed.step.folder.parent.glob(".*"))
+    assert damage(filed.step, verify=True) is None and not list(filed.step.folder.parent.glob(".*"))
 
 
 def in_a_process(folder: Path, size: int, limit: int) -> None:
@@ -142,6 +143,8 @@ def test_a_damaged_checkpoint_is_one_line_and_counts_as_none(tmp_path, capsys, d
 def test_one_that_was_being_written_leaves_the_one_before(tmp_path):
     step = stopped(tmp_path, 3)
     left(step).with_name(f"{CHECKPOINT}.unfinished").write_bytes(left(step).read_bytes()[:100])
+    for name in ("manifest.json", "arrays.safetensors", "other.bin"):  # killed while the result was written
+        left(step).with_name(name).write_bytes(b"half")
     assert_right(run(step, "cpu"), tmp_path)
     assert diary(tmp_path) == [*range(STEPS)]
 

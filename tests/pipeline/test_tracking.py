@@ -222,7 +222,7 @@ def test_curves_grow_and_previews_appear_while_a_step_is_at_work_and_none_comes_
     made = Tracking(folder, config={}, name="x", tags={})
     made.begin(step)
     assert not made.broken
-    run, at_work = made.live.run, step.folder.with_name(f".{step.fingerprint}")
+    run, at_work = made.live.run, step.unfinished
     log = Log(at_work, quiet=True)
 
     def shown() -> list[tuple[int, float]]:
