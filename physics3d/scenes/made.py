@@ -77,12 +77,7 @@ class MadeTwin(AbstractSource):
 
     def __call__(self, *, log) -> Capture:
         self.check()
-<<<<<<< HEAD
-        light = Light(backdrop=(0.80, 0.83, 0.86))
         seen: Any = dict(target=self.target, distance=self.distance, opening=self.opening)
-=======
-        seen = dict(target=self.target, distance=self.distance, opening=self.opening)
->>>>>>> things
         return captured(
             name=self.name,
             world=self.world,
