@@ -36,7 +36,7 @@ class Journal:
             self.log.warn(f"it takes another path than before it was stopped, from evaluation {self.told + 1} on")
         self.noted[self.told :] = [[key, answer()]]
         self.told += 1
-        self.checkpoint.save(self.noted, f"after {self.told} evaluations")
+        self.checkpoint.save(self.noted, f"after evaluation {self.told}")
         return self.noted[-1][1]
 
 
