@@ -146,9 +146,10 @@ def page(rows: list[Row], missing: str, *, twins: int, draws: int, steps: int) -
     for prior, span, group in grouped(rows, "landscape", "range"):
         off = np.array([row["lowest"] for row in group])
         still = np.mean([row["still"] for row in group])
+        beside = f"{still:.3g}" if np.isfinite(still) else "the best has none"
         valleys = max(row["valleys"] for row in group)
         lines.append(
-            f"| {prior} | {span} | {off.mean():+.2f} ({off[np.abs(off).argmax()]:+.2f}) | {valleys} | {still:.3g} |"
+            f"| {prior} | {span} | {off.mean():+.2f} ({off[np.abs(off).argmax()]:+.2f}) | {valleys} | {beside} |"
         )
     lines += [
         "",

@@ -129,9 +129,9 @@ def landscape(twins: list[Twin], draws: int, prior_of: PriorOf) -> list[Row]:
                     range=f"{span[0]:g}-{span[1]:g}",
                     lowest=lowest(GRID, loss),
                     valleys=int(((np.diff(loss)[:-1] < 0) & (np.diff(loss)[1:] > 0)).sum()),
-                    rise_below=float(loss[0] / loss[best]),
-                    rise_above=float(loss[-1] / loss[best]),
-                    still=float(unmoved / loss[best]),
+                    rise_below=over(loss[0], loss[best]),
+                    rise_above=over(loss[-1], loss[best]),
+                    still=over(unmoved, loss[best]),
                     curve=loss.tolist(),
                 )
             )
@@ -285,6 +285,11 @@ def descend(
             theta.clamp_(-3.0, 3.0)
         course.append(float(theta.detach()))
     return course
+
+
+def over(loss: float, best: float) -> float:
+    """So many times the best, which an exact denoiser may bring to 0."""
+    return float(loss / best) if best > 0 else math.inf
 
 
 def lowest(x: np.ndarray, y: np.ndarray) -> float:
