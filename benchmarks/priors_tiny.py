@@ -1,7 +1,7 @@
 """What distillation from the small video model finds, where the answer is known: rows of the laboratory of priors.
 
-    python benchmarks/priors_tiny.py [weights=folder] [sections=landscape,gradient,distil,must,plain] [twins=3] [draws=8]
-                                     [steps=60] [estimator=stratified] [range=0]
+    python benchmarks/priors_tiny.py [weights=folder] [sections=landscape,gradient,distil,must,plain] [twins=3]
+                                     [draws=8] [steps=60] [estimator=stratified] [range=0]
 
 The model was trained on films of stems whose ln E is normal around ln MODE (`physics3d/scenes/stems.py`), so that is
 where E has to be pulled, from wherever it starts. Twins are of forms that it has not seen. theta = ln(E/MODE).
