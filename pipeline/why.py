@@ -64,7 +64,8 @@ def explain(config: dict[str, Any], shelf: Path) -> Iterator[str]:
     if guessed:
         yield f"{'':>16} | {guessed}"
     if waiting and len(whole.steps) > 1:
-        yield f"{waiting} of {len(whole.steps)} steps would run; those here took {seconds:.0f} s in other runs"
+        known = f"; those that have run here before took {seconds:.0f} s" if seconds else ""
+        yield f"{waiting} of {len(whole.steps)} steps would run{known}"
     elif not waiting:
         yield f"up to date: all {len(whole.steps)} steps were computed before"
 

@@ -135,6 +135,8 @@ def test_fields_read_from_the_source_are_those_of_the_class(path):
 
 # ---- what is recommended
 
+MISSPELT = {"learn.stepz"}  # the first hour shows what is said of it
+
 
 def recommended() -> list[str]:
     """key=value and group=value in README, docs, comments, docstrings and error messages."""
@@ -150,7 +152,7 @@ def recommended() -> list[str]:
     for file in files:
         if file.suffix in (".md", ".py", ".yaml", ""):
             words |= set(re.findall(pattern, prose(file)))
-    return sorted(word.rstrip(".:") for word in words)
+    return sorted(word.rstrip(".:") for word in words if word.partition("=")[0] not in MISSPELT)
 
 
 def prose(file: Path) -> str:
@@ -174,16 +176,16 @@ def mentioned() -> list[str]:
     for folder in ("stages", "pipeline", "physics3d"):
         for file in (ROOT / folder).rglob("*.py"):
             words |= set(re.findall(pattern, prose(file)))
-    return sorted(w for w in words if not re.search(modules, w))
+    return sorted(w for w in words - MISSPELT if not re.search(modules, w))
 
 
 SCENE_OF = {
+    "start.stem": "carnation_parts",
     "scene.camera_distance": "clip",
     "camera_distance": "photos",
     "prompts.0.view": "photos",
     "boundaries.0.point": "trained",
 }
-PRIOR_OF = {"prior.prompt": "modelscope", "prior.time": "modelscope"}
 
 
 @pytest.mark.parametrize("word", recommended())
@@ -191,13 +193,17 @@ def test_what_is_recommended_composes(word):
     key, _, value = word.partition("=")
     scene = next((f"scene={s}" for part, s in SCENE_OF.items() if part in key), "scene=carnation")
     words = [word] if key == "scene" else ["scene=carnation_parts", word] if value == "parts" else [scene, word]
+    if key.startswith("prior."):
+        words.insert(
+            0, next(f"prior={p}" for p in choices("prior") if key[6:] in composed((f"prior={p}",))[0]["prior"])
+        )
     compose(words)
 
 
 @pytest.mark.parametrize("key", mentioned())
 def test_what_is_mentioned_exists(key):
     found = False
-    for word in ("", "scene=bird", "scene=clip", "prior=modelscope", "prior=stable_video", "masker=sam2"):
+    for word in ("", "scene=bird", "scene=clip", *(f"prior={p}" for p in choices("prior")), "masker=sam2"):
         words = (word,) if word else ()
         node: Any = composed(words)[0]
         for name in key.split("."):

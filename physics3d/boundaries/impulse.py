@@ -31,10 +31,10 @@ class Impulse(base.AbstractBoundary):
     take force = P/duration."""
 
     force: base.Vector | Tensor | None = None  # in total [N]
-    acceleration_of_each: base.Vector | Tensor | None = None  # [m/s^2]
-    centre: base.Vector | None = None  # [m]
-    radius: Length | None = None  # [m]
-    nearest: Count | None = None  # particles
+    acceleration_of_each: base.Vector | Tensor | None = None  # of each particle there, whatever it weighs [m/s^2]
+    centre: base.Vector | None = None  # of the ball, or what the nearest particles are near [m]
+    radius: Length | None = None  # of the ball [m]
+    nearest: Count | None = None  # so many particles, those nearest to the centre
     lower: base.Vector | None = None  # corners of a box [m]
     upper: base.Vector | None = None
     start: Time = 0.0

@@ -22,7 +22,7 @@ from physics3d.priors.estimators.base import AbstractEstimator, Target
 @dataclass(frozen=True, kw_only=True)
 class Stratified(AbstractEstimator):
     of: AbstractEstimator  # whose draws are averaged
-    levels: Annotated[int, Ge(1), Le(1000)] = 4
+    levels: Annotated[int, Ge(1), Le(1000)] = 4  # of noise in a step, one from each of so many equally probable ranges
 
     def __post_init__(self):
         require_fields(self, "estimator")
