@@ -101,8 +101,8 @@ class Learn:
         self.field(self.world.estimate(), speed=1.0)
 
     def fits(self, outline: Outline) -> None:
-        """Raise ValueError if a take of this outline is too short, or the prior too large for its device, as far as that
-        is known."""
+        """Raise ValueError if a take of this outline is too short, or the prior too large for its device, as far as
+        that is known."""
         recorded = [take for take in outline.takes or () if take.role == "learn"]
         if not recorded and outline.takes is not None and self.imagined is not None and not self.prior.needs_clip:
             recorded = [self.imagined.footage]
@@ -114,7 +114,8 @@ class Learn:
         """Raises ValueError if there is no take to learn from, or a name, frame count or camera does not fit."""
         take = capture.take("learn")
         if take is None and self.imagined is not None and not self.prior.needs_clip:
-            take = self.imagined.take(capture, gaussians, device=self.device)
+            falls = any(self.world.gravity) or any(self.world.velocity)
+            take = self.imagined.take(capture, gaussians, falls=falls, device=self.device)
         if take is None:
             raise ValueError(
                 f"capture {capture.name} has no take with role learn; leave out the learning, record a motion, or take "

@@ -57,6 +57,7 @@ class AbstractPrior(ABC):
 
     def require_frames(self, frames: int) -> None:
         """Raises ValueError, naming the nearest right numbers, if it cannot be shown clips of so many frames."""
+        return None
 
     def memory(self, frames: int) -> Memory | None:
         """What it will take to show it clips of so many frames, known before its weights are loaded; None: next to

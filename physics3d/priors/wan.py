@@ -16,7 +16,6 @@ the next is kept, all else recomputed.
 
 import gc
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import Annotated, Any, NamedTuple
@@ -51,7 +50,9 @@ class Wan(AbstractPrior):
     first_image: bool = False  # whether it is told the first image too; Wan2.2-TI2V-5B takes one
     clip_frames: Frames = 81  # of the clips that it was trained on; 2.2: 121
     precision: Precision = "bfloat16"  # of the network and the text encoder; float32 on a CPU
-    vae_precision: Precision = "bfloat16"  # of the VAE, on the way from the pixels and back; float32 takes twice as much
+    vae_precision: Precision = (
+        "bfloat16"  # of the VAE, on the way from the pixels and back; float32 takes twice as much
+    )
     offload: bool = False  # whether the network waits in the machine's memory while the VAE works
     device: Device = "cuda"
     height: Annotated[Pixels, MultipleOf(16)] = 480  # what the network sees [px]; 2.2: a multiple of 32
@@ -79,9 +80,7 @@ class Wan(AbstractPrior):
         from diffusers import WanPipeline
 
         pipe = self.suited(
-            load_pipeline(
-                WanPipeline, self.model, key="prior.model", dtype=self.dtypes, variant=None, without=READER
-            )
+            load_pipeline(WanPipeline, self.model, key="prior.model", dtype=self.dtypes, variant=None, without=READER)
         )
         for module in (pipe.vae, pipe.transformer):
             module.requires_grad_(False).eval()
@@ -90,7 +89,8 @@ class Wan(AbstractPrior):
         return pipe
 
     def suited(self, pipe: Any) -> Any:
-        """The pipeline without its decoder, and with an encoder that recomputes. Raises ValueError if it is of another kind than these options say."""
+        """The pipeline without its decoder, and with an encoder that recomputes. Raises ValueError if it is of another
+        kind than these options say."""
         if pipe.transformer is None or pipe.transformer_2 is not None:
             raise ValueError(
                 f"prior.model={self.model} has two networks, one for each half of the schedule; take one that has one, "
@@ -150,7 +150,8 @@ class Wan(AbstractPrior):
             below = max(5, frames - (frames - 1) % 4)
             near = f"{below} or {below + 4}" if frames > 5 else f"{below}"
             raise ValueError(
-                f"learn.frames is {frames}; Wan takes 4 n + 1 frames: take {near} (it was trained on {self.clip_frames})"
+                f"learn.frames is {frames}; Wan takes 4 n + 1 of them: take {near} (it was trained on "
+                f"{self.clip_frames})"
             )
 
     def encode(self, video: Float[Tensor, "t h w 3"]) -> Float[Tensor, "T c H W"]:
@@ -164,7 +165,9 @@ class Wan(AbstractPrior):
         )
         pixels = (2 * frames - 1).to(vae.device, vae.dtype).transpose(0, 1)[None]
         means = encoded(vae, pixels)[0, : vae.config.z_dim].float().transpose(0, 1)  # then as many log variances
-        mean, std = (torch.tensor(v).to(means)[:, None, None] for v in (vae.config.latents_mean, vae.config.latents_std))
+        mean, std = (
+            torch.tensor(v).to(means)[:, None, None] for v in (vae.config.latents_mean, vae.config.latents_std)
+        )
         return (means - mean) / std
 
     def level(self, share: float) -> Level:

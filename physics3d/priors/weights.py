@@ -1,6 +1,7 @@
 """Where published weights come from: a local folder, else the hub's cache, else the hub, else one clear message."""
 
 import importlib
+import inspect
 import json
 from pathlib import Path
 from typing import Any, Literal
@@ -35,8 +36,8 @@ def hollow_pipeline(
     folder = pipeline_folder(kind, name, key=key, variant=variant)
     dtypes = dtype if isinstance(dtype, dict) else {"default": dtype}
     try:
-        index = {k: v for k, v in json.loads((folder / "model_index.json").read_text()).items() if k[0] != "_"}
-        parts = {part: None if part in without else made for part, made in index.items()}
+        index, known = json.loads((folder / "model_index.json").read_text()), inspect.signature(kind).parameters
+        parts = {part: None if part in without else made for part, made in index.items() if part in known}
         for part, named in parts.items():
             if isinstance(named, list):
                 parts[part] = hollow(named, folder / part, dtypes.get(part, dtypes["default"]))
