@@ -60,8 +60,8 @@ def hollow(named: list[str | None], folder: Path, dtype: torch.dtype) -> Any:
             network = kind.from_config(kind.load_config(folder, local_files_only=True))
         else:  # of transformers
             network = kind(kind.config_class.from_pretrained(folder, local_files_only=True))
-    # not by its own `to`, which warns of lower precision in what loading would keep precise
-    return torch.nn.Module.to(network.requires_grad_(False).eval(), dtype)
+    # some make a tensor wherever they are; not by its own `to`, which warns of what loading would keep precise
+    return torch.nn.Module.to(network.requires_grad_(False).eval(), "meta", dtype)
 
 
 def pipeline_files(kind: Any, name: str, *, key: str, variant: str | None) -> tuple[str, ...]:
