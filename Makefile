@@ -34,7 +34,7 @@ export $(words)
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .PHONY: help setup run why sweep compare pin unpin collect score twin train-prior fit-curves export still film report ui graph view test newest bench lint \
-	handbook configuration architecture clean
+	handbook scenes configuration architecture clean
 py := .venv/bin/python
 # torch's own threads spin beside those of the renderer and the simulator: OMP_NUM_THREADS=1 unless you say otherwise
 threads := OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1}
@@ -143,6 +143,9 @@ handbook: $(ready) ## write docs/handbook.md from conf/handbook.yaml
 
 configuration: $(ready) ## write docs/configuration.md from conf/ and the hints of the classes that it names
 	@PYTHONPATH=. $(py) docs/write_configuration.py
+
+scenes: $(ready) ## draw docs/scenes/*.jpg, a picture of each scene that is composed of shapes
+	@PYTHONPATH=. $(threads) $(py) docs/draw_scenes.py
 
 architecture: $(ready) ## draw docs/architecture.png and its table from the imports
 	@$(py) docs/draw_architecture.py

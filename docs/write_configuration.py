@@ -35,18 +35,17 @@ COMMON = {
     "height": "of a picture [px]",
     "fps": "frames in a second [1/s]",
     "frames": "of the motion",
-    "poissons_ratio": "nu of the elastic branch: how much it thins when drawn out",
     "density": "mass over volume at rest [kg/m^3]",
     "hole_upper": "the opposite corner of that [m]",
     "lower": "the corner of the box with the smallest coordinates [m]",
     "upper": "the opposite corner [m]",
-    "start": "when it begins [s]",
-    "duration": "for how long [s]",
+    "start": "when it begins",
+    "duration": "for how long",
     "velocity": "of the motion [m/s]",
     "point": "a point on it [m]",
     "axis": "the direction of the axis",
     "kind": "sticky: nothing moves on it; slip: only along it; separate: what moves away from it may",
-    "interval": "between one layer and the next [s]",
+    "interval": "between one layer and the next",
     "layers": "how many slices",
     "box": "left, top, right, bottom of a box in the picture, as fractions of its width and height",
     "views": "how many photographs are made",
@@ -104,7 +103,8 @@ class NoWords(ValueError):
 
 
 def entries(path: Path) -> Iterator[Entry]:
-    """What a file says, in its order: scalars, lists of scalars, and mappings on one line that are no class's."""
+    """What a file says, in its order: scalars, lists of scalars, mappings on one line that are no class's, and of a
+    mapping of names to objects (shapes, materials of parts) the names."""
     text = path.read_text()
     comments = _comments(text)
 
@@ -120,6 +120,9 @@ def entries(path: Path) -> Iterator[Entry]:
                     yield Entry(key=inner, value="", comment=comment)
                 for i, item in enumerate(items):
                     yield from walk(item, (*inner, str(i)))
+            elif isinstance(value, yaml.MappingNode) and _named_classes(value):
+                names = ", ".join(part.value for part, _ in value.value)
+                yield Entry(key=inner, value=names, comment=comment)
             elif isinstance(value, yaml.MappingNode) and not (value.flow_style and _target(value) is None):
                 if comment:
                     yield Entry(key=inner, value="", comment=comment)
@@ -131,6 +134,12 @@ def entries(path: Path) -> Iterator[Entry]:
     node = yaml.compose(text, Loader=LOADER)
     if isinstance(node, yaml.MappingNode):
         yield from walk(node, ())
+
+
+def _named_classes(node: yaml.MappingNode) -> bool:
+    """Whether it is names, each with an object of a class (shapes, materials of parts), and nothing else."""
+    of_a_class = [isinstance(value, yaml.MappingNode) and _target(value) is not None for _, value in node.value]
+    return bool(of_a_class) and all(of_a_class)
 
 
 def _comments(text: str) -> dict[int, str]:
@@ -201,6 +210,12 @@ def remark(kind: str, field: str) -> str:
     return ""
 
 
+def usual(field: str) -> str:
+    """What a name means wherever it stands: one of `COMMON`, or a parameter of the usual materials."""
+    known = [remarks(f"physics3d.materials.{module}").get(field, "") for module in ("parameters", "viscoelastic")]
+    return COMMON.get(field) or next(filter(None, known), "")
+
+
 def parameter(model: dict[str, Any], name: str) -> str:
     """The comment of a parameter of a material."""
     part, _, bare = re.sub(r"_[23]$", "", name).rpartition(".")
@@ -208,10 +223,7 @@ def parameter(model: dict[str, Any], name: str) -> str:
         return parameter(model["materials"][part], bare)
     inside = [model["solid"]["_target_"]] if "solid" in model else []
     modules = [path.rpartition(".")[0] for path in (model["_target_"], *inside)]
-    for module in (*modules, "physics3d.materials.parameters", "physics3d.materials.viscoelastic"):
-        if text := remarks(module).get(bare):
-            return text
-    return ""
+    return next((text for module in modules if (text := remarks(module).get(bare))), "") or usual(bare)
 
 
 # ---- words
@@ -295,18 +307,18 @@ class Page:
             remark(kind, entry.key[-1]) if kind else "",
             taker.comment if taker else "",
             self.of_a_part(entry.key)[0],
-            COMMON.get(entry.key[-1], ""),
+            usual(entry.key[-1]),
             f"that of `{link[1]}`" if link else "",
         )
         found = [split(comment, entry.value) for comment in comments]
         return next((words for words, _ in found if words), ""), next((unit for _, unit in found if unit), "")
 
     def row(self, name: str, value: str, words: str, unit: str, hint: Any, where: str) -> str:
-        may, usual = allowed(hint)
+        may, of_hint = allowed(hint)
         if not words:
             self.unexplained.append(f"{where}: {name}")
         value = value if value == NEEDED else code(value)
-        return f"| `{name}` | {cell(value)} | {unit or usual} | {cell(may)} | {cell(words)} |"
+        return f"| `{name}` | {cell(value)} | {unit or of_hint} | {cell(may)} | {cell(words)} |"
 
     def table(self, path: Path, among: Iterator[Entry] | list[Entry], cut: int = 0) -> list[str]:
         """Entries of a file; the first `cut` names of each key are left out."""
@@ -410,6 +422,7 @@ class Page:
         yield "## What a scene is made of\n\nClasses that a scene names by `_target_`, with all their fields.\n"
         for title, package, base in (
             ("Sources", "physics3d.scenes", "physics3d.scenes.base.AbstractSource"),
+            ("Shapes of made scenes", "physics3d.scenes", "physics3d.scenes.shapes.AbstractShape"),
             ("Prompts", "physics3d.segmentation", "physics3d.segmentation.prompts.Prompt"),
             ("Boundaries and excitations", "physics3d.boundaries", "physics3d.boundaries.base.AbstractBoundary"),
             ("Models of materials", "physics3d.materials", "physics3d.materials.base.AbstractMaterial"),
@@ -421,8 +434,8 @@ class Page:
                 if of.hints:
                     yield f"| field | {' | '.join(TITLES[1:])} |\n" + "|" + "---|" * len(TITLES)
                     for field, hint in of.hints.items():
-                        own, usual = split(remark(kind, field)), split(COMMON.get(field, ""))
-                        words, unit = (a or b for a, b in zip(own, usual, strict=True))
+                        own, elsewhere = split(remark(kind, field)), split(usual(field))
+                        words, unit = (a or b for a, b in zip(own, elsewhere, strict=True))
                         yield self.row(field, written(of, field), words, unit, hint, kind)
                     yield ""
 

@@ -130,9 +130,16 @@ def up_to_date(config: dict[str, Any], shelf: Path, verify: bool) -> Plan | None
 
 
 def execute(
-    config: dict[str, Any], shelf: Path, home: Path, device: str, verify: bool, done: Callable[[Filed], None]
+    config: dict[str, Any],
+    shelf: Path,
+    home: Path,
+    device: str,
+    verify: bool,
+    begin: Callable[[Step], None],
+    done: Callable[[Filed], None],
 ) -> tuple[Plan, list[Filed]]:
-    """Run the graph under Prefect; `done` is called after each step. Raises StageError with one line."""
+    """Run the graph under Prefect; `begin` is called before each step that is computed, `done` after every one. Raises
+    StageError with one line."""
 
     stages: dict[str, Any] = {}
     with server(home, meanwhile=lambda: stages.update(built(config, device))):
@@ -143,6 +150,8 @@ def execute(
             filed: dict[Step, Filed] = {}
 
             def compute(step: Step) -> None:
+                if damage(step, verify):
+                    begin(step)
                 filed[step] = as_task(step, device, verify)([filed[s] for s in before(step)])
                 done(filed[step])
 

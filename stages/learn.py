@@ -31,7 +31,7 @@ from physics3d.gaussians.model import Gaussians
 from physics3d.learning.chain import chain_of
 from physics3d.learning.course import Point, history
 from physics3d.learning.curves import curves
-from physics3d.learning.fields import AXES, GlobalField, physical
+from physics3d.learning.fields import AXES, AbstractField, GlobalField, physical
 from physics3d.learning.fit import fit
 from physics3d.learning.imagined import Imagined
 from physics3d.learning.interval import Beyond, intervals, is_stiff, posterior, words
@@ -39,6 +39,7 @@ from physics3d.learning.linear import Shown, shown
 from physics3d.learning.loss import Chain
 from physics3d.learning.polish import polish
 from physics3d.learning.search import search
+from physics3d.learning.stiffness_field import WIDTH, StiffnessField, asked_for, is_node, picture, trilinear
 from physics3d.learning.unknown_cause import learned_free
 from physics3d.log import Log
 from physics3d.pictures import contact_sheet, to_uint8
@@ -86,6 +87,8 @@ class Learn:
     beyond: Beyond = dataclasses.field(default_factory=Beyond)  # widths of what the clip does not show
     largest_gradient: Positive = 3.0  # clip of the global norm, in units of the loss at the start per unit of theta
     zones: Annotated[int, Ge(1), Le(16)] = 4  # of stiffness, where the cause of the motion is unknown
+    # of a field of stiffness, along the body's longest side; taken where the clip asks for it. 0: one stiffness
+    nodes: Literal[0] | Annotated[int, Ge(2), Le(32)] = 0
     device: Device = "cpu"
     seed: Seed = 0
 
@@ -134,62 +137,72 @@ class Learn:
         if memory := self.prior.memory(len(indices)):
             log.info(f"the prior takes {memory.require()}")
         seconds = int(indices[-1]) / take.fps
-        field = self.field(start, speed=self.natural_speed(body, seconds))
-        chain = chain_of(
-            self.world,
-            self.prior,
-            self.estimator,
-            field,
-            capture,
-            gaussians,
-            body,
-            take,
-            indices,
-            image_scale=self.image_scale,
-            device=self.device,
-            log=log,
-        )
+        whole = self.field(start, speed=self.natural_speed(body, seconds))
+
+        def chained(field: AbstractField, log: Log) -> Chain:
+            return chain_of(
+                self.world,
+                self.prior,
+                self.estimator,
+                field,
+                capture,
+                gaussians,
+                body,
+                take,
+                indices,
+                image_scale=self.image_scale,
+                device=self.device,
+                log=log,
+            )
+
+        chain = chained(whole, log)
         trained = self.prior.trained_frames
         if trained not in (None, len(indices)):
             log.warn(f"{len(indices)} frames are shown to a prior that was trained on clips of {trained}")
         log.info(
-            f"learning {', '.join(field.names)} from take {take.name}: {len(indices)} frames over {seconds:.2f} s, "
+            f"learning {', '.join(whole.names)} from take {take.name}: {len(indices)} frames over {seconds:.2f} s, "
             f"{len(chain.clips)} camera(s), {len(body.position)} particles"
         )
-        theta = field.zero()
+        theta = whole.zero()
         course: list[Point] = []
         if self.search:
-            theta, course = self.searched(chain, field, log)
+            theta, course = self.searched(chain, whole, log)
         if self.steps:
-            theta, descent = fit(
-                chain,
-                field,
-                theta,
-                steps=self.steps,
-                learning_rate=self.learning_rate,
-                views_per_step=self.views_per_step,
-                frames_per_step=self.frames_per_step,
-                stay=self.stay,
-                largest_gradient=self.largest_gradient,
-                seed=self.seed,
-                log=log,
-            )
+            theta, descent = self.descended(chain, whole, theta, log)
             course += descent
         if self.polish and not chain.comparable:
             log.info("no polish: single losses of this prior and estimator cannot be compared")
         elif self.polish:
-            theta, polished = polish(chain, field, theta, steps=self.polish, stay=self.stay, seed=self.seed, log=log)
+            theta, polished = polish(chain, whole, theta, steps=self.polish, stay=self.stay, seed=self.seed, log=log)
             course += polished
-        seen = shown(chain, field, theta, seed=self.seed) if chain.certain else None
+        seen = shown(chain, whole, theta, seed=self.seed) if chain.certain else None
+        field: AbstractField = whole
+        known = history(whole, course)
+        if self.nodes and seen is None:
+            log.info("no field of stiffness: residuals tell whether a clip asks for one, and this prior has none")
+        elif self.nodes and seen is not None:
+            finer = StiffnessField(whole=whole, weights=trilinear(body.position, self.nodes))
+            over, more = replace(chained(finer, Log(None)), journal=chain.journal), finer.zero()
+            more[: len(theta)] = theta
+            more, descent = self.descended(over, finer, more, log)
+            if self.polish and over.comparable:
+                more, polished = polish(over, finer, more, steps=self.polish, stay=self.stay, seed=self.seed, log=log)
+                descent += polished
+            losses = chain.measure(theta, self.seed), over.measure(more, self.seed)
+            if asked_for(losses, finer, seen.evidence, log):
+                field, theta, chain, seen = finer, more, over, shown(over, finer, more, seed=self.seed)
+                known = {name: [*known.get(name, []), *curve] for name, curve in history(finer, descent).items()}
         learned = replace(
             start,
             parameters={name: v.detach().to(torch.float32) for name, v in field.parameters(theta).items()},
             velocity=field.velocity(theta).detach().to(torch.float32),
-            history=history(field, course),
+            history=known,
             intervals=self.intervals(field, theta, seen, section, log) if seen else {},
         )
         self.report(capture, field, learned, seen, log)
         if log.folder is not None:
+            if isinstance(field, StiffnessField):
+                log.image("stiffness", picture(body.position, learned.parameters))
             if course:
                 log.image("parameters", curves(capture, learned))
             with torch.no_grad():
@@ -199,6 +212,22 @@ class Learn:
                 "reference_above_learned", contact_sheet(to_uint8(torch.cat([chain.clips[view], clip], 1)), columns=5)
             )
         return learned
+
+    def descended(self, chain: Chain, field: AbstractField, theta: Tensor, log: Log) -> tuple[Tensor, list[Point]]:
+        """Where gradient descent ends, and its course."""
+        return fit(
+            chain,
+            field,
+            theta,
+            steps=self.steps,
+            learning_rate=self.learning_rate,
+            views_per_step=self.views_per_step,
+            frames_per_step=self.frames_per_step,
+            stay=self.stay,
+            largest_gradient=self.largest_gradient,
+            seed=self.seed,
+            log=log,
+        )
 
     def spread(self, take: Footage) -> Tensor:
         """Which frames of the take are used: the first, and others spread over all of the duration.
@@ -250,7 +279,7 @@ class Learn:
         return search(chain, field, directions, offsets, seed=self.seed, log=log)
 
     def intervals(
-        self, field: GlobalField, theta: Tensor, seen: Shown, section: Section | None, log: Log
+        self, field: AbstractField, theta: Tensor, seen: Shown, section: Section | None, log: Log
     ) -> dict[str, Interval]:
         """Of every learned number. `section`: the thinnest beside what is held, by which the grid may be coarser than
         is usual."""
@@ -260,22 +289,27 @@ class Learn:
         unit = field.velocity_scale or 1.0
         speed = [float(v) / unit for v in field.velocity(theta)] if field.velocity_scale else []
         stiff = np.array([float(is_stiff(name)) for name in field.names])
-        fast = np.array([0.0] * len(field.groups) + speed)
+        nodes = [0.0] * (len(field.names) - len(field.groups) - len(speed))
+        fast = np.array([0.0] * len(field.groups) + speed + nodes)
         after = posterior(
             theta.detach().numpy(),
             seen.evidence,
-            before=np.array([self.guess_widths.get(n.split("+")[0], self.guess_width) for n in field.names]),
+            before=np.array([self.width(n.split("+")[0]) for n in field.names]),
             beyond=beyond.covariance(stiff, fast, seen.push),
             log=log,
         )
         return intervals(field, after)
 
-    def report(self, capture: Capture, field: GlobalField, learned: Estimate, seen: Shown | None, log: Log) -> None:
+    def width(self, name: str) -> float:
+        """Of what is thought of a component of theta before the clip."""
+        return WIDTH if is_node(name) else self.guess_widths.get(name, self.guess_width)
+
+    def report(self, capture: Capture, field: AbstractField, learned: Estimate, seen: Shown | None, log: Log) -> None:
         """One line per number: from, to, truth, how visible it is and between what it lies, as far as that is known."""
         before = physical(field, field.zero())
         after = {name: float(value.mean()) for name, value in learned.parameters.items()}
         after |= dict(zip(AXES, learned.velocity.tolist()))
-        for i, name in enumerate(field.names):
+        for i, name in enumerate(n for n in field.names if not is_node(n)):  # nodes are the last ones
             visible = ""
             if seen is not None:
                 log.metric(f"sensitivity/{name}", 255 * float(seen.rms[i]))

@@ -181,6 +181,9 @@ def mentioned() -> list[str]:
 
 SCENE_OF = {
     "start.stem": "carnation_parts",
+    "source.name": "lego",
+    "source.scale": "lego",
+    "source.world": "jelly",
     "scene.camera_distance": "clip",
     "camera_distance": "photos",
     "prompts.0.view": "photos",
@@ -217,22 +220,24 @@ def test_what_is_mentioned_exists(key):
 COUNTED = re.compile(
     r"(^|\.)(seed|views|width|height|frames|iterations|max_gaussians|longest_side|sh_degree|check_every|patience|size|"
     r"rounds|steps|frames_per_step|views_per_step|polish|search|paint|every|most_points|image_size|motion_bucket|"
-    r"branches|max_substeps|held_out_cameras\.\d+|view|checkpoint_bytes)$"
+    r"branches|max_substeps|held_out_cameras\.\d+|view|checkpoint_bytes|copies|curls|flutes|veins)$"
 )
 SIGNED = re.compile(
     r"(gravity|velocity|point|normal|force|acceleration_of_each|centre|lower|upper|up)\.(\d|[xyz])$|(poissons_ratio|quadratic_coefficient)$|"
-    r"prior\.guidance(\.\d)?$|truth\.\w+$"
+    r"prior\.guidance(\.\d)?$|truth\.\w+$|(path|profile)\.\d+\.[12]$|path\.\d+\.0$|(across|turn|carried_at|foot|target)\.\d$|"
+    r"(fold|curl_height)$"
 )
 ZERO_IS_FINE = re.compile(
     r"(^|\.)(seed|sh_degree|rounds|steps|frames_per_step|views_per_step|polish|search|paint|motion_bucket|branches|view|"
     r"damping|friction|start|stay|ssim_weight|opacity|drop_pieces_below|opacity_weight|scale_weight|noise|noise_strength|"
     r"enclosure|hardening|hardening_modulus|second_modulus|cubic_modulus|viscosity|power_index|checkpoint_bytes|held_out_cameras\.\d+)$|"
-    r"rates\.(?!final)\w+$|beyond\.\w+$|blur\.\d$|(positive|negative)\.\d+\.\d$"
+    r"rates\.(?!final)\w+$|beyond\.\w+$|blur\.\d$|(positive|negative)\.\d+\.\d$|(colour|second|half_widths)\.\d+$|"
+    r"(bands|profile)\.\d+\.\d$|(mottle|translucency|flutes|flute_depth|curls|coil|turns|lobes|waves)$"
 )
 ENDLESS = re.compile(r"(shear|bulk)_relaxation_time(_[23])?$")
 NULL_IS_FINE = re.compile(
     r"(resolution|sheet_thickness|learn\.(duration|frames)|floaters|variant|simulate\.force|render\.view|world\.(dt|checkpoint_bytes)|"
-    r"prompts\.\d\.box)$"
+    r"prompts\.\d\.box|veins)$"
 )
 WORD_IS_FINE = re.compile(r"(prompts\.\d\.view|render\.view)$")
 CHOICES = re.compile(r"(kind|precision|scheme|solver|spring|flow|isolated|attach|device|learn\.\d+|ties\.\d\.\d)$")
@@ -265,7 +270,7 @@ def legal(key: str, old: Any, new: Any) -> bool | None:
     if new == 0:
         if key == "material.model.branches":
             return None  # a viscoelastic solid may have its elastic branch alone, a solid with branches needs one
-        if re.search(r"\.normal\.|\.up\.", key):
+        if re.search(r"\.normal\.|\.up\.|\.across\.", key):
             return None
         return bool(SIGNED.search(key) or ZERO_IS_FINE.search(key))
     return False if COUNTED.search(key) else None  # 1.5
@@ -297,6 +302,13 @@ def composed(words: tuple[str, ...]) -> tuple[dict, dict]:
     return config, {key: paths for key, paths in reached.items() if any(p[0] in taken for p in paths)}
 
 
+def alike(key: str) -> str:
+    """The same for all points of a list, and for all shapes of a thing that is made of them."""
+    return re.sub(
+        r"\b(path|profile|bands|half_widths|radii)\.\d+", r"\1", re.sub(r"\b(moving|still)\.\w+", "shape", key)
+    )
+
+
 SETTINGS = [()]
 SETTINGS += [
     (f"{g}={n}",) for g in ("scene", "prior", "estimator", "masker", "densification", "solid") for n in choices(g)
@@ -311,7 +323,9 @@ def test_every_number_and_name_that_cannot_be_is_refused_in_one_line(words):
     config, reached = composed(words)
     usual, own = dict(leaves(composed(())[0])) if words else {}, dict(leaves(config))
     tried = 0
-    for key, paths in reached.items():
+    kinds = {alike(key): key for key in reversed(reached)}  # the first of each kind
+    for key in kinds.values():
+        paths = reached[key]
         old = own[paths[0]]
         if words and usual.get(paths[0], ...) == old:
             continue

@@ -46,6 +46,12 @@ def rows(title: str) -> dict[str, list[str]]:
     return {row[0].strip(" `"): [cell.strip() for cell in row[1:]] for row in cells}
 
 
+def ancestors(key: str) -> list[str]:
+    """The nearest first."""
+    parts = key.split(".")
+    return [".".join(parts[:i]) for i in range(len(parts) - 1, 0, -1)]
+
+
 CHOICES = [(group, name) for group in GROUPS for name in choices(group)]
 
 
@@ -58,7 +64,9 @@ def test_every_entry_of_every_choice_is_on_the_page_with_words(group, name):
             if key in ("learn", "ties"):
                 continue  # they are in the line above the tables
             key = key.removeprefix("start.")
-        shown = next((k for k in (key, key.rpartition(".")[0]) if k in found), None)  # a mapping on one line is one row
+        # a mapping on one line, and names with an object each, are one row, which has a value
+        above = [key, *(k for k in ancestors(key) if k in found and found[k][0])]
+        shown = next((k for k in above if k in found), None)
         assert shown, f"conf/{group}/{name}.yaml: {key} is not on the page"
         assert len(found[shown][-1]) > 1, key
 

@@ -11,7 +11,8 @@ from physics3d.boundaries.impulse import Impulse
 from physics3d.filling.body import Body
 from physics3d.gaussians.deform import Backdrop, render_deformed
 from physics3d.gaussians.model import Gaussians
-from physics3d.learning.fields import GlobalField
+from physics3d.journal import Journal
+from physics3d.learning.fields import AbstractField
 from physics3d.learning.loss import Chain
 from physics3d.log import Log
 from physics3d.priors.base import AbstractPrior
@@ -25,7 +26,7 @@ def chain_of(
     world: World,
     prior: AbstractPrior,
     estimator: AbstractEstimator,
-    field: GlobalField,
+    field: AbstractField,
     capture: Capture,
     gaussians: Gaussians,
     body: Body,
@@ -105,6 +106,7 @@ def chain_of(
         prior=prior,
         estimator=estimator,
         pushed=pushed if forced else None,
+        journal=Journal(log),
     )
 
 

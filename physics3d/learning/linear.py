@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from physics3d.learning.fields import GlobalField
+from physics3d.learning.fields import AbstractField
 from physics3d.learning.loss import Chain
 from physics3d.learning.sandwich import Evidence, blocks, correlation_length
 from physics3d.priors.base import draws
@@ -38,14 +38,19 @@ class _Seen:
     weight: float  # w
 
 
-def linearise(chain: Chain, field: GlobalField, theta: Tensor, *, seed: int, step: float = STEP) -> Linear:
+def linearise(chain: Chain, field: AbstractField, theta: Tensor, *, seed: int, step: float = STEP) -> Linear:
     """J by forward differences in theta: k + 1 simulations, none of them differentiated."""
+    made = lambda: _linearised(chain, theta, seed, step)
+    return Linear(*chain.journal.ask("linearise", theta, seed, step, answer=made))
+
+
+def _linearised(chain: Chain, theta: Tensor, seed: int, step: float) -> tuple[Tensor, Tensor]:
     k = len(theta)
     JJ, Jr = torch.zeros(k, k).double(), torch.zeros(k).double()
     pixels = sum(clip.numel() for clip in chain.clips.values())
     for seen in _around(chain, _motions(chain, theta, step), seed, step):
         JJ, Jr = JJ + seen.weight * seen.J.T @ seen.J, Jr + seen.weight * seen.J.T @ seen.r
-    return Linear(JJ / pixels, Jr / pixels)
+    return JJ / pixels, Jr / pixels
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,12 +62,18 @@ class Shown:
     rms: Float[np.ndarray, " k"]  # change of the code per unit of theta, colour in 0..1
 
 
-def shown(chain: Chain, field: GlobalField, theta: Tensor, *, seed: int, step: float = STEP) -> Shown:
+def shown(chain: Chain, field: AbstractField, theta: Tensor, *, seed: int, step: float = STEP) -> Shown:
     """k + 1 simulations, and one more where a known force drives the motion.
 
     Scores are counted where the pictures are: s(x) = g(x) dvideo(x)/dtheta with g the gradient of the SDS loss by the
     colours of pixel x, whatever the prior's code.
     """
+    made = lambda: _shown(chain, theta, seed, step)
+    told = chain.journal.ask("shown", theta, seed, step, answer=made)
+    return Shown(evidence=Evidence(**told["evidence"]), push=told["push"], rms=told["rms"])
+
+
+def _shown(chain: Chain, theta: Tensor, seed: int, step: float) -> dict[str, Any]:
     k = len(theta)
     motions = _motions(chain, theta, step)
     if chain.pushed is not None:
@@ -93,14 +104,15 @@ def shown(chain: Chain, field: GlobalField, theta: Tensor, *, seed: int, step: f
         scores.append(summed(s))
         shares.append(summed(I))
     push = np.linalg.pinv(JJ[:k, :k], hermitian=True) @ JJ[:k, k] if len(JJ) > k else np.zeros(k)
-    evidence = Evidence(JJ=JJ[:k, :k], score=np.concatenate(scores, 1), share=np.concatenate(shares, 1))
-    return Shown(evidence=evidence, push=push, rms=np.sqrt(squares[:k] / max(count, 1)))
+    evidence = dict(JJ=JJ[:k, :k].copy(), score=np.concatenate(scores, 1), share=np.concatenate(shares, 1))
+    return dict(evidence=evidence, push=push, rms=np.sqrt(squares[:k] / max(count, 1)))
 
 
 def _motions(chain: Chain, theta: Tensor, step: float) -> list[Any]:
     """At theta, and a step beside it in each component."""
+    places = (theta, *(theta + step * torch.eye(len(theta), dtype=theta.dtype)))
     with torch.no_grad():
-        return [chain.simulate(t) for t in (theta, *(theta + step * torch.eye(len(theta), dtype=theta.dtype)))]
+        return [chain.simulate(t) for t in chain.journal.log.progress(places, "looking around")]
 
 
 def _around(chain: Chain, motions: list[Any], seed: int, step: float) -> Iterator[_Seen]:

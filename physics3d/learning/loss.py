@@ -7,6 +7,8 @@ Those who descend add the second, each in its way (`fit.py`, `polish.py`). `Chai
 compared by, the denoising loss by always the same noise (`priors/distillation.py`); L_0 is that at the start. With a
 prior whose estimate does not depend on the noise both are the same; of a diffusion model single values of `loss` tell
 nothing.
+
+All that takes long is asked of the chain's journal, so that a learning that was stopped goes on where it was.
 """
 
 from collections.abc import Callable
@@ -18,6 +20,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from physics3d.journal import Journal
+from physics3d.log import Log
 from physics3d.priors.base import AbstractPrior
 from physics3d.priors.distillation import denoising_loss, distillation_loss
 from physics3d.priors.estimators.base import AbstractEstimator
@@ -37,6 +41,7 @@ class Chain:
     estimator: AbstractEstimator = field(default_factory=ScoreDistillation)
     # theta [k], ln of a factor on every known force -> trajectory; None: no force is known that drives the motion
     pushed: Callable[[Tensor, float], Any] | None = None
+    journal: Journal = field(default_factory=lambda: Journal(Log(None)))
 
     @cached_property
     def certain(self) -> bool:
@@ -67,8 +72,26 @@ class Chain:
             pixels += video.numel()
         return total / pixels  # type: ignore[return-value]
 
+    def slope(
+        self, theta: Float[Tensor, " k"], views: list[int], frames: Tensor, generator: torch.Generator
+    ) -> tuple[float, Float[Tensor, " k"]]:
+        """(the first term of L, its derivative by theta)."""
+
+        def answer() -> dict[str, Any]:
+            at = theta.detach().clone().requires_grad_()
+            loss = self.loss(at, views, frames, generator)
+            loss.backward()
+            return dict(loss=float(loss.detach()), slope=at.grad, generator=generator.get_state())
+
+        told = self.journal.ask("slope", theta, views, frames, generator.get_state(), answer=answer)
+        generator.set_state(told["generator"])
+        return told["loss"], told["slope"]
+
     def measure(self, theta: Tensor, seed: int) -> float:
         """The denoising loss over all views and frames, always with the same noise."""
+        return self.journal.ask("measure", theta, seed, answer=lambda: self._measured(theta, seed))
+
+    def _measured(self, theta: Tensor, seed: int) -> float:
         generator, total, pixels = torch.Generator().manual_seed(seed), 0.0, 0
         with torch.no_grad():
             motion = self.simulate(theta)

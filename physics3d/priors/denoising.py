@@ -4,7 +4,8 @@
 
 V is the mean of |z0 - still|^2, how much there is to be known. w is about one over the error of a perfect denoiser: V
 where the noise hides everything, and as r^2 falls where a clip can be told from its neighbours. Adam with a warm-up and
-a cosine to zero; what is kept are weights averaged over the last steps. Half the clips are seen in a mirror.
+a cosine to zero; what is kept are weights averaged over the last steps. Half the clips are seen in a mirror,
+and all with their colours exchanged at random: there are more of them then.
 
 The state is written every minute, whole or not at all, with the state of the random numbers: a training that was killed
 goes on where it was and ends, on the same machine, with the same bits.
@@ -16,7 +17,7 @@ import os
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import torch
 from jaxtyping import Float, UInt8
@@ -37,11 +38,10 @@ class Training:
 
     steps: Count = 2000
     batch: Count = 16
-    learning_rate: Positive = 1e-3
+    learning_rate: Positive = 1.5e-3
     warm_up: Whole = 50  # steps
     average: Count = 100  # steps over which weights are averaged, at the end
     ratio: Annotated[tuple[Positive, Positive], Ascending()] = (1.0, 60.0)  # sigma/alpha
-    precision: Literal["float32", "bfloat16"] = "float32"  # of products of matrices
     seed: Seed = 0
     device: Device = "cpu"
 
@@ -114,8 +114,7 @@ class _Run:
         for group in self.adam.param_groups:
             group["lr"] = options.learning_rate * warm * 0.5 * (1 + math.cos(math.pi * step / options.steps))
         self.adam.zero_grad()
-        with torch.autocast(options.device.split(":")[0], torch.bfloat16, enabled=options.precision == "bfloat16"):
-            loss = (denoising_error(self.network, z0, ratio, noise) * weight(ratio)).mean() / self.scale
+        loss = (denoising_error(self.network, z0, ratio, noise) * weight(ratio)).mean() / self.scale
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), LARGEST_GRADIENT)
         self.adam.step()
@@ -182,11 +181,13 @@ def codes(clips: UInt8[Tensor, "n t h w 3"]) -> Float[Tensor, "n t 3 h w"]:
 
 
 def batch(clips: Tensor, count: int, generator: torch.Generator) -> Float[Tensor, "b t 3 h w"]:
-    """Drawn with repetition, half of them mirrored."""
+    """Drawn with repetition, half of them mirrored, red, green and blue in any order."""
     which = torch.randint(len(clips), (count,), generator=generator)
     mirrored = torch.rand(count, generator=generator) < 0.5
+    order = torch.rand(count, 3, generator=generator).argsort(1)
     z0 = codes(clips[which])
-    return torch.where(mirrored[:, None, None, None, None], z0.flip(-1), z0)
+    z0 = torch.where(mirrored[:, None, None, None, None], z0.flip(-1), z0)
+    return torch.gather(z0, 2, order[:, None, :, None, None].expand_as(z0))
 
 
 def ratios(span: tuple[float, float], count: int, generator: torch.Generator) -> Float[Tensor, " b"]:

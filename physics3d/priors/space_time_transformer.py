@@ -4,7 +4,7 @@
                              taken away: alpha (z0 - s) + sigma n
     x0_hat = s + f(d, s, ln(sigma/alpha))
 
-f sees tokens of `patch` x `patch` pixels of one frame, d beside s; all tokens of the clip attend to each other. The
+f sees tokens of `patch` x `patch` pixels of `span` frames, d beside s; all tokens of the clip attend to each other. The
 level of noise scales and shifts what every layer gets and gates what it adds (adaLN-Zero, Peebles and Xie 2023). f
 begins as zero: before any training the network believes that nothing moves. It answers with the clip, not with noise or
 v: a patch has more numbers than a token, and noise does not fit through, clips do (Li and He 2025, "Back to basics: let
@@ -28,13 +28,16 @@ class Architecture:
     frames: Count = 16
     size: Pixels = 32  # of the square pictures [px]
     patch: Pixels = 8  # [px]
-    width: Count = 192  # numbers in a token, a multiple of 32
-    layers: Count = 6
+    span: Count = 2  # frames in a token
+    width: Count = 128  # numbers that stand for a token, a multiple of 32
+    layers: Count = 4
 
     def __post_init__(self):
         require_fields(self, "architecture")
         if self.size % self.patch:
             raise ValueError(f"architecture.patch is {self.patch}; take a divisor of architecture.size ({self.size})")
+        if self.frames % self.span:
+            raise ValueError(f"architecture.span is {self.span}; take a divisor of architecture.frames ({self.frames})")
         if self.width % HEAD:
             raise ValueError(f"architecture.width is {self.width}; take a multiple of {HEAD}")
 
@@ -50,13 +53,13 @@ class SpaceTimeTransformer(nn.Module):
         super().__init__()
         self.architecture = a = architecture
         pixels, side = 3 * a.patch**2, a.size // a.patch
-        self.noisy, self.still = nn.Linear(pixels, a.width), nn.Linear(pixels, a.width)
-        self.when = nn.Parameter(0.02 * torch.randn(a.frames, 1, a.width))
+        self.noisy, self.still = nn.Linear(a.span * pixels, a.width), nn.Linear(pixels, a.width)
+        self.when = nn.Parameter(0.02 * torch.randn(a.frames // a.span, 1, a.width))
         self.where = nn.Parameter(0.02 * torch.randn(1, side**2, a.width))
         self.level = nn.Sequential(nn.Linear(WAVES, a.width), nn.SiLU(), nn.Linear(a.width, a.width), nn.SiLU())
         self.layers = nn.ModuleList(Layer(a.width) for _ in range(a.layers))
         self.last = nn.Linear(a.width, 2 * a.width)  # scale and shift before the answer
-        self.answer = nn.Linear(a.width, pixels)
+        self.answer = nn.Linear(a.width, a.span * pixels)
         for layer in (self.last, self.answer):
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
@@ -70,9 +73,9 @@ class SpaceTimeTransformer(nn.Module):
     ) -> Float[Tensor, "b t 3 h w"]:
         """x0_hat of clips with colours in -1..1."""
         frames = still[:, None].expand_as(z_t)
-        patch = self.architecture.patch
-        noisy = tokens(z_t - alpha[:, None, None, None, None] * frames, patch)
-        x = self.noisy(noisy) + self.still(tokens(still[:, None], patch)) + self.when + self.where
+        patch, span = self.architecture.patch, self.architecture.span
+        noisy = tokens(z_t - alpha[:, None, None, None, None] * frames, patch, span)
+        x = self.noisy(noisy) + self.still(tokens(still[:, None], patch, 1)) + self.when + self.where
         b, t, n, width = x.shape
         x = x.reshape(b, t * n, width)
         level = self.level(waves(torch.log(sigma / alpha)))
@@ -80,7 +83,7 @@ class SpaceTimeTransformer(nn.Module):
             x = layer(x, level)
         scale, shift = self.last(level)[:, None].chunk(2, -1)
         x = self.answer(norm(x) * (1 + scale) + shift)
-        return frames + pictures(x.reshape(b, t, n, -1), patch).to(z_t.dtype)
+        return frames + pictures(x.reshape(b, t, n, -1), patch, span).to(z_t.dtype)
 
 
 class Layer(nn.Module):
@@ -117,16 +120,17 @@ def waves(level: Float[Tensor, " b"]) -> Float[Tensor, "b k"]:
     return torch.cat([angle.sin(), angle.cos()], 1)
 
 
-def tokens(x: Float[Tensor, "b t 3 h w"], patch: int) -> Float[Tensor, "b t n d"]:
-    """Patches, row by row."""
+def tokens(x: Float[Tensor, "b t 3 h w"], patch: int, span: int) -> Float[Tensor, "b k n d"]:
+    """Blocks of `span` frames and of patches, row by row."""
     b, t, c, h, w = x.shape
-    x = x.reshape(b, t, c, h // patch, patch, w // patch, patch)
-    return x.permute(0, 1, 3, 5, 2, 4, 6).reshape(b, t, (h // patch) * (w // patch), c * patch**2)
+    x = x.reshape(b, t // span, span, c, h // patch, patch, w // patch, patch)
+    x = x.permute(0, 1, 4, 6, 2, 3, 5, 7)
+    return x.reshape(b, t // span, (h // patch) * (w // patch), span * c * patch**2)
 
 
-def pictures(x: Float[Tensor, "b t n d"], patch: int) -> Float[Tensor, "b t 3 h w"]:
+def pictures(x: Float[Tensor, "b k n d"], patch: int, span: int) -> Float[Tensor, "b t 3 h w"]:
     """The inverse of `tokens`, of square pictures."""
-    b, t, n, d = x.shape
+    b, k, n, _ = x.shape
     side = math.isqrt(n)
-    x = x.reshape(b, t, side, side, d // patch**2, patch, patch)
-    return x.permute(0, 1, 4, 2, 5, 3, 6).reshape(b, t, d // patch**2, side * patch, side * patch)
+    x = x.reshape(b, k, side, side, span, 3, patch, patch)
+    return x.permute(0, 1, 4, 5, 2, 6, 3, 7).reshape(b, k * span, 3, side * patch, side * patch)

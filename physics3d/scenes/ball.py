@@ -26,10 +26,10 @@ from physics3d.checks import (
     require_fields,
 )
 from physics3d.materials.viscoelastic import Viscoelastic
-from physics3d.scenes.base import AbstractSource, Capture, Footage, Outline
-from physics3d.scenes.photographs import held_out, triple
-from physics3d.scenes.studio import Light, Mesh, Studio, photographs, ring, surface_grid, to_linear
-from physics3d.scenes.synthetic import film, particles, view_names
+from physics3d.scenes.base import AbstractSource, Capture, Outline
+from physics3d.scenes.photographs import triple
+from physics3d.scenes.studio import Light, Mesh, Studio, ring, surface_grid, to_linear
+from physics3d.scenes.synthetic import captured, outlined, particles
 from physics3d.world import World
 
 RADIUS = 0.05  # [m]
@@ -68,8 +68,7 @@ class BallTwin(AbstractSource):
 
     @property
     def outline(self) -> Outline:
-        takes = tuple(Footage(name=role, role=role, frames=self.frames, fps=self.fps) for role in ("learn", "evaluate"))
-        return Outline(name="ball", names=view_names(self.views), mattes=True, takes=takes)
+        return outlined("ball", self.views, self.frames, self.fps, mattes=True)
 
     def __call__(self, *, log) -> Capture:
         require_fields(self, "source")
@@ -90,10 +89,6 @@ class BallTwin(AbstractSource):
                 height=self.height,
                 opening=36,
             )
-        images, alphas, points, colors = photographs(
-            studio.pose(), cameras, points=self.points, noise=2e-4, seed=self.seed, log=log
-        )
-        position, volume = particles([mesh], self.dx / 2, self.seed)
         push = Impulse(
             force=triple("evaluate_force", self.evaluate_force),
             centre=centre,
@@ -101,7 +96,7 @@ class BallTwin(AbstractSource):
             start=0.0,
             duration=self.push,
         )
-        witness = ring(
+        (witness,) = ring(
             (0.0, 0.0, RADIUS),
             distance=0.32,
             elevation=12,
@@ -110,41 +105,25 @@ class BallTwin(AbstractSource):
             height=self.height,
             opening=36,
         )
-        takes = [
-            film(
-                role=role,
-                world=self.world(),
-                excitation=excitation,
-                position=position,
-                volume=volume,
-                studio=studio,
-                cameras=witness,
-                frames=self.frames,
-                fps=self.fps,
-                device=self.device,
-                log=log,
-            )
-            for role, excitation in (("learn", ()), ("evaluate", (push,)))
-        ]
-        capture = Capture(
+        return captured(
             name="ball",
-            images=tuple(images),
-            cameras=tuple(cameras),
-            names=view_names(len(cameras)),
-            held_out=held_out(len(images), self.held_out_every),
-            alphas=tuple(alphas),
-            background=light.backdrop,
-            points=points,
-            point_colors=colors,
-            takes=tuple(takes),
+            world=self.world(),
+            pokes={"learn": (), "evaluate": (push,)},
+            matter=particles([mesh], self.dx / 2, self.seed),
+            studio=studio,
+            cameras=cameras,
+            witness=witness,
+            frames=self.frames,
+            fps=self.fps,
+            points=self.points,
+            noise=2e-4,
+            held_out_every=self.held_out_every,
+            seed=self.seed,
+            device=self.device,
             single_object=True,
-            floor=0.0,
-            truth=self.world().start,
-            truth_source="set in the code that made this twin",
             note="this is a synthetic twin: ball, photographs and motion are made by code, so its material is known",
+            log=log,
         )
-        capture.check()
-        return capture
 
     def world(self) -> World:
         """The physics that the reference motion obeys, with the true parameters as start."""

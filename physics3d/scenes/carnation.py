@@ -11,8 +11,6 @@ pipeline takes, and the pictures are ray traced from meshes: learning has to see
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from physics3d.boundaries.fixed_region import FixedRegion
 from physics3d.boundaries.impulse import Impulse
 from physics3d.checks import (
@@ -31,11 +29,12 @@ from physics3d.checks import (
 )
 from physics3d.gaussians.cameras import Camera
 from physics3d.materials.viscoelastic import Viscoelastic
-from physics3d.scenes.base import AbstractSource, Capture, Footage, Outline
+from physics3d.scenes import room
+from physics3d.scenes.base import AbstractSource, Capture, Outline
 from physics3d.scenes.flower import SOIL, blossom_centre, plant, surroundings
-from physics3d.scenes.photographs import held_out, triple
-from physics3d.scenes.studio import Light, Studio, photographs, ring
-from physics3d.scenes.synthetic import film, particles, view_names
+from physics3d.scenes.photographs import triple
+from physics3d.scenes.studio import Studio
+from physics3d.scenes.synthetic import captured, outlined, particles
 from physics3d.world import World
 
 
@@ -71,72 +70,37 @@ class CarnationTwin(AbstractSource):
 
     @property
     def outline(self) -> Outline:
-        takes = tuple(Footage(name=role, role=role, frames=self.frames, fps=self.fps) for role in ("learn", "evaluate"))
-        return Outline(name="carnation", names=view_names(self.views), mattes=False, takes=takes)
+        return outlined("carnation", self.views, self.frames, self.fps)
 
     def __call__(self, *, log) -> Capture:
         require_fields(self, "source")
         meshes, solids = plant(self.seed)
-        light = Light(backdrop=(0.80, 0.83, 0.86))
-        studio = Studio([*meshes, *surroundings(self.seed)], light, openness_rays=24, seed=self.seed)
-        cameras = photographers(self.views, self.width, self.height)
-        images, _, points, colors = photographs(
-            studio.pose(), cameras, points=self.points, noise=4e-4, seed=self.seed, log=log
-        )
-        position, volume = particles(solids, self.dx / 2, self.seed)
-        (witness,) = ring(
-            TARGET,
-            distance=0.5,
-            elevation=14,
-            azimuths=np.array([-84.0]),
-            width=self.width,
-            height=self.height,
-            opening=OPENING,
-        )
-        takes = [
-            film(
-                role=role,
-                world=self.world(),
-                excitation=(
-                    Impulse(
-                        force=triple("force", force),
-                        centre=blossom_centre(),
-                        radius=0.05,
-                        start=0.0,
-                        duration=self.push,
-                    ),
-                ),
-                position=position,
-                volume=volume,
-                studio=studio,
-                cameras=[witness],
-                frames=self.frames,
-                fps=self.fps,
-                device=self.device,
-                log=log,
-            )
+        studio = Studio([*meshes, *surroundings(self.seed)], room.DAYLIGHT, openness_rays=24, seed=self.seed)
+        centre = blossom_centre()
+        pokes = {
+            role: (Impulse(force=triple("force", force), centre=centre, radius=0.05, start=0.0, duration=self.push),)
             for role, force in (("learn", self.learn_force), ("evaluate", self.evaluate_force))
-        ]
-        capture = Capture(
+        }
+        return captured(
             name="carnation",
-            images=tuple(images),
-            cameras=tuple(cameras),
-            names=view_names(len(cameras)),
-            held_out=held_out(len(images), self.held_out_every),
-            background=light.backdrop,
-            points=points,
-            point_colors=colors,
-            takes=tuple(takes),
-            floor=0.0,
-            truth=self.world().start,
-            truth_source="set in the code that made this twin",
+            world=self.world(),
+            pokes=pokes,
+            matter=particles(solids, self.dx / 2, self.seed),
+            studio=studio,
+            cameras=photographers(self.views, self.width, self.height),
+            witness=room.witness(self.width, self.height, target=TARGET, distance=DISTANCE, opening=OPENING),
+            frames=self.frames,
+            fps=self.fps,
+            points=self.points,
+            held_out_every=self.held_out_every,
+            seed=self.seed,
+            device=self.device,
             note=(
                 "this is a synthetic twin: flower, photographs and motion are made by code, so its material is known; "
                 "for a real capture set scene.source to a folder of photographs with cameras (see README)"
             ),
+            log=log,
         )
-        capture.check()
-        return capture
 
     def world(self) -> World:
         """The physics that the reference motion obeys, with the true parameters as start."""
@@ -152,18 +116,10 @@ class CarnationTwin(AbstractSource):
 
 
 TARGET = (0.012, 0.0, 0.137)  # what cameras look at [m]
+DISTANCE = 0.5  # of all cameras from there [m]
 OPENING = 44.0  # of the lens, across [deg]
 
 
 def photographers(views: int, width: int, height: int) -> list[Camera]:
-    """Cameras on three rings around the front of the flower, never behind the backdrop."""
-    rings = ((14.0, 0.45), (32.0, 0.35), (58.0, 0.20))  # elevation [deg], share of the views
-    counts = [round(views * share) for _, share in rings]
-    counts[0] += views - sum(counts)
-    cameras = []
-    for i, ((elevation, _), count) in enumerate(zip(rings, counts)):
-        azimuths = -90 + np.linspace(-112, 112, count) + 4 * (i - 1)
-        cameras += ring(
-            TARGET, distance=0.5, elevation=elevation, azimuths=azimuths, width=width, height=height, opening=OPENING
-        )
-    return cameras
+    """Cameras on three rings around the front of the flower."""
+    return room.photographers(views, width, height, target=TARGET, distance=DISTANCE, opening=OPENING)

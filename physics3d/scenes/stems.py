@@ -3,8 +3,8 @@
     ln E ~ N(ln MODE, SPREAD^2),   density 300 kg/m^3, Poisson's ratio 0.3
 
 A square stem stands on the ground and carries an ellipsoid; both are one neo-Hookean solid, cut into cubes of half the
-stem's width. Its blossom is poked sideways for a tenth of a second, at the beginning of the film, and the body sways
-freely for the rest of it. Drawn are: the stem's width and height, the blossom's size, flatness and colours, the side
+stem's width. Its blossom is poked sideways for 40 ms, at the beginning of the film, and the body sways freely for the
+rest of it. Drawn are: the stem's width and height, the blossom's size, flatness and colours, the side
 and the direction of the poke, the speed that it would give the blossom if nothing held it, and the camera. Everything
 but ln E and the poke can be seen in the first frame, so that the frequency of the film tells E.
 
@@ -41,8 +41,10 @@ from physics3d.world import World
 MODE, SPREAD = 1.0e6, 0.35  # of Young's modulus [Pa]: median, standard deviation of the logarithm
 DENSITY, POISSON, DRAG = 300.0, 0.3, 1.0  # [kg/m^3], 1, [1/s]
 SPEED, SPEED_SPREAD = 0.30, 0.15  # that a poke would give a free blossom [m/s]: median, deviation of the logarithm
-PUSH = 0.1  # how long it lasts [s]
-FRAMES, FPS, PIXELS = 16, 20.0, 32  # of a film: 0.75 s, square
+PUSH = 0.04  # how long it lasts [s]
+# of a film, square: 0.3 s, about half a period, so that two films differ the more, the more their frequencies do, up to
+# twice; over a whole period a film of twice the frequency is nearer to the right one than one of 1.7 times
+FRAMES, FPS, PIXELS = 16, 50.0, 32
 WIDTH = 0.018  # of the stem of a body of size 1 [m]
 MODES, POINTS = 6, 80  # of vibration, of integration: a stem bends in few ways
 BACKGROUND = (1.0, 1.0, 1.0)
@@ -62,11 +64,11 @@ class Stem:
     def draw_form(cls, rng: np.random.Generator) -> Self:
         """Of size 1 and the usual stiffness."""
         return cls(
-            cubes=int(rng.integers(17, 23)), blossom=float(rng.uniform(1.6, 2.2)), flat=float(rng.uniform(0.75, 1.1))
+            cubes=int(rng.integers(18, 22)), blossom=float(rng.uniform(1.65, 2.1)), flat=float(rng.uniform(0.8, 1.05))
         )
 
     def draw_size(self, rng: np.random.Generator) -> Self:
-        return replace(self, size=float(np.exp(rng.uniform(np.log(15 / 18), np.log(21 / 18)))))
+        return replace(self, size=float(np.exp(rng.uniform(np.log(15.5 / 18), np.log(20.5 / 18)))))
 
     @property
     def edge(self) -> float:

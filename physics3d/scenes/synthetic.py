@@ -7,25 +7,97 @@ Solids are sampled with particles of their own, and vertices follow the particle
 which is exact for affine motion.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Bool, Float, Float32
 from torch import Tensor
 
 from physics3d.boundaries.base import AbstractBoundary
 from physics3d.gaussians.cameras import Camera
 from physics3d.mpm.rollout import rollout
 from physics3d.open3d_import import open3d
-from physics3d.scenes.base import Take
-from physics3d.scenes.studio import Mesh, Studio
+from physics3d.scenes.base import Capture, Footage, Outline, Take
+from physics3d.scenes.photographs import held_out
+from physics3d.scenes.studio import Mesh, Studio, photographs
 from physics3d.world import World
 
 
 def view_names(count: int) -> tuple[str, ...]:
     """Of the photographs of a twin."""
     return tuple(f"view_{i:03d}" for i in range(count))
+
+
+def outlined(name: str, views: int, frames: int, fps: float, *, mattes: bool = False) -> Outline:
+    """What a twin will be, before it is made."""
+    takes = tuple(Footage(name=role, role=role, frames=frames, fps=fps) for role in ("learn", "evaluate"))
+    return Outline(name=name, names=view_names(views), mattes=mattes, takes=takes)
+
+
+def captured(
+    *,
+    name: str,
+    world: World,
+    pokes: Mapping[str, tuple[AbstractBoundary, ...]],
+    matter: tuple[Float32[np.ndarray, "p 3"], Float32[np.ndarray, " p"]],
+    studio: Studio,
+    cameras: list[Camera],
+    witness: Camera,
+    frames: int,
+    fps: float,
+    points: int,
+    held_out_every: int,
+    seed: int,
+    device: str,
+    note: str,
+    log,
+    single_object: bool = False,
+    noise: float = 4e-4,
+) -> Capture:
+    """A twin, photographed by `cameras` at rest and filmed by `witness` once for each role in `pokes`.
+
+    `matter` is position [m] and volume [m^3] of the particles; there are `points` surface points, `noise` [m] off
+    along each axis.
+    """
+    images, alphas, found, colors = photographs(studio.pose(), cameras, points=points, noise=noise, seed=seed, log=log)
+    position, volume = matter
+    takes = [
+        film(
+            role=role,
+            world=world,
+            excitation=excitation,
+            position=position,
+            volume=volume,
+            studio=studio,
+            cameras=[witness],
+            frames=frames,
+            fps=fps,
+            device=device,
+            log=log,
+        )
+        for role, excitation in pokes.items()
+    ]
+    capture = Capture(
+        name=name,
+        images=tuple(images),
+        cameras=tuple(cameras),
+        names=view_names(len(cameras)),
+        held_out=held_out(len(images), held_out_every),
+        alphas=tuple(alphas) if single_object else (),
+        background=studio.light.backdrop,
+        points=found,
+        point_colors=colors,
+        takes=tuple(takes),
+        single_object=single_object,
+        floor=0.0,
+        truth=world.start,
+        truth_source="set in the code that made this twin",
+        note=note,
+    )
+    capture.check()
+    return capture
 
 
 def film(
@@ -85,18 +157,25 @@ def particles(
 
     One jittered point per cube of side `spacing` [m] inside, counted once where meshes overlap.
     """
-    o3d = open3d()
     rng = np.random.default_rng(seed)
     lower, upper = (f([f(m.vertices, 0) for m in solids], 0) for f in (np.min, np.max))
     axes = [np.arange(a - spacing * rng.random(), b + spacing, spacing) for a, b in zip(lower, upper)]
     lattice = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     lattice = (lattice + 0.7 * spacing * (rng.random(lattice.shape) - 0.5)).astype(np.float32)
-    inside = np.zeros(len(lattice), bool)
+    inside = within(solids, lattice)
+    return lattice[inside], np.full(inside.sum(), spacing**3, np.float32)
+
+
+def within(solids: list[Mesh], points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    """Which points [m] are inside of one of the closed meshes."""
+    o3d = open3d()
+    points = o3d.core.Tensor(np.ascontiguousarray(points, np.float32))
+    inside = np.zeros(len(points), bool)
     for mesh in solids:
         scene = o3d.t.geometry.RaycastingScene()
         scene.add_triangles(o3d.core.Tensor(mesh.vertices), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
-        inside |= scene.compute_occupancy(o3d.core.Tensor(lattice), nsamples=3).numpy() > 0.5
-    return lattice[inside], np.full(inside.sum(), spacing**3, np.float32)
+        inside |= scene.compute_occupancy(points, nsamples=3).numpy() > 0.5
+    return inside
 
 
 @dataclass(frozen=True)
