@@ -239,18 +239,20 @@ def in_files(prior, part):
 @pytest.mark.parametrize("name", ["stable_video", "modelscope", *WANS])
 def test_what_is_said_beforehand_is_what_it_takes(models, name):
     """The largest sum of living allocations of one step, as torch's profiler saw them on the CPU, beside parameters.
-    30 %: convolutions take scratch space there."""
-    prior = replace(models[name], height=96, width=96)
-    frames = 9
-    video = clip(0, (frames, 96, 96, 3)).requires_grad_()
+
+    There a convolution in three dimensions copies every input 27 times, which a GPU does not and the estimate leaves
+    out: of Wan's VAE with 8 channels of a piece. 20 %: what other operations there take for themselves.
+    """
+    prior, frames = replace(models[name], height=64, width=64), 5
+    video = clip(0, (frames, 64, 64, 3)).requires_grad_()
     condition = prior.condition(video.detach()[0], ())
     with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as seen:
         pulled(prior, video, condition, 0)
     networks = [m for m in prior.pipeline.components.values() if isinstance(m, torch.nn.Module)]
     weights = sum(map(parameter_bytes, networks))
-    said = prior.memory(frames)
-    assert said.needed == pytest.approx(weights + largest(seen), rel=0.3)
-    assert largest(seen) > weights, "or weights alone would do"
+    copies = {"wan": 27 * 8 * 4 * 64 * 64 * 4, "wan_image": 27 * 8 * 4 * 32 * 32 * 4}.get(name, 0)
+    assert prior.memory(frames).needed + copies == pytest.approx(weights + largest(seen), rel=0.2)
+    assert largest(seen) > 1.5 * copies, "or the copies alone would do"
 
 
 def largest(seen):
@@ -275,13 +277,14 @@ def test_a_device_that_is_not_there_is_said():
         Memory(device="cuda:1", needed=1, remedy="").require()
 
 
-def test_offload_takes_less_of_the_device_and_answers_the_same(models):
-    for prior in models.values():
-        frames = 9
-        here, there = (replace(prior, device="cuda", offload=offload).memory(frames) for offload in (False, True))
-        assert there.needed < here.needed and there.beside > here.beside
-        lean = replace(prior, offload=True)
-        video = clip(3, (frames, prior.height, prior.width, 3))
-        z0 = prior.encode(video)
+@pytest.mark.parametrize("name", ["modelscope", "wan"])
+def test_offload_takes_less_of_the_device_and_answers_the_same(models, name):
+    prior, frames = models[name], 5
+    here, there = (replace(prior, device="cuda", offload=offload).memory(frames) for offload in (False, True))
+    assert there.needed < here.needed and there.beside > here.beside
+    lean = replace(prior, offload=True)
+    video = clip(3, (frames, prior.height, prior.width, 3))
+    z0 = prior.encode(video)
+    with torch.no_grad():
         answers = [p.x0_hat(z0, p.level(0.3), p.condition(video[0], ())) for p in (prior, lean)]
-        assert torch.equal(*answers)
+    assert torch.equal(*answers)
