@@ -33,8 +33,8 @@ export $(words)
 
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup run why sweep pin unpin collect score twin fit-curves export film report ui graph view test newest bench lint \
-	handbook scenes architecture clean
+.PHONY: help setup run why sweep compare pin unpin collect score twin train-prior fit-curves export still film report ui graph view test newest bench lint \
+	handbook scenes configuration architecture clean
 py := .venv/bin/python
 # torch's own threads spin beside those of the renderer and the simulator: OMP_NUM_THREADS=1 unless you say otherwise
 threads := OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1}
@@ -54,7 +54,7 @@ help: ## this list
 	@echo "  SCENE=$$SCENE PROFILE=$$PROFILE METHOD=$$METHOD DATA=$$DATA ARGS=\"$$ARGS\""
 	@echo '  scenes: $(basename $(notdir $(wildcard conf/scene/*.yaml)))'
 
-setup: $(ready) ## .venv with everything in it (5 to 10 minutes, 7 GB, once)
+setup: $(ready) ## .venv with everything in it (5 to 10 minutes, 8.5 GB on disk, once)
 
 $(ready): pyproject.toml setup.py constraints.txt
 	@"$$PYTHON" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -77,6 +77,10 @@ sweep: $(ready) ## many runs at once: SCENES=carnation,ball METHODS=... SEEDS=0,
 	@$(threads) $(with_args) -m pipeline.sweep scenes="$$SCENES" methods="$$METHODS" seeds="$$SEEDS" runner="$$RUNNER" workers="$$WORKERS" \
 		address="$$ADDRESS" profile="$$PROFILE" $${DATA:+data="$$DATA"}
 
+compare: $(ready) ## every method on SCENES=carnation,cake, the paper's table: [METHODS=...] [OUT=<folder>]
+	@$(threads) $(with_args) -m pipeline.compare scenes="$${SCENES:-$$SCENE}" methods="$$METHODS" $${RUNNER:+runner="$$RUNNER"} \
+		$${WORKERS:+workers="$$WORKERS"} $${OUT:+out="$$OUT"} profile="$$PROFILE" $${DATA:+data="$$DATA"}
+
 pin unpin: $(ready) ## keep a result whatever is cleaned or collected: make pin RESULT=learn/<fingerprint>
 	@$(py) -m pipeline.shelf $@ "$$RESULT"
 
@@ -89,8 +93,14 @@ score: $(ready) ## any two videos compared: REAL=<clip> PRED=<clip> [OUT=<folder
 twin: $(ready) ## a thing with known material as photographs and clips on disk: OUT=<new folder>
 	@$(threads) $(py) -m pipeline.twin
 
+train-prior: $(ready) ## a small video model from films it makes; goes on where it was: [OUT=outputs/tiny_video] [ARGS="steps=... seed=0 device=cpu"]
+	@$(threads) $(with_args) -m pipeline.train_prior
+
 export: $(ready) ## the moving Gaussians for other programs: FORMAT=ply|usd|gltf [OUT=<new folder>] [FRAME=<of gltf>]
 	@$(threads) $(with_args) -m pipeline.export $(of_run)
+
+still: $(ready) ## the picture to hand to an image-to-video model: [OUT=<new .png>] [SIZE=1024x576]; then capture.clip=<its clip>
+	@$(threads) $(with_args) -m pipeline.still $(of_run)
 
 film: $(ready) ## the motion from a camera that goes round it: [OUT=<new .mp4>] [SIZE=1280x720] [LENGTH=<seconds>]
 	@$(threads) $(with_args) -m pipeline.film $(of_run)
@@ -131,6 +141,9 @@ lint: $(ready) ## style and types
 handbook: $(ready) ## write docs/handbook.md from conf/handbook.yaml
 	@PYTHONPATH=. $(py) docs/write_handbook.py
 
+configuration: $(ready) ## write docs/configuration.md from conf/ and the hints of the classes that it names
+	@PYTHONPATH=. $(py) docs/write_configuration.py
+
 scenes: $(ready) ## draw docs/scenes/*.jpg, a picture of each scene that is composed of shapes
 	@PYTHONPATH=. $(threads) $(py) docs/draw_scenes.py
 
@@ -138,5 +151,5 @@ architecture: $(ready) ## draw docs/architecture.png and its table from the impo
 	@$(py) docs/draw_architecture.py
 
 clean: ## remove results and caches (artifacts, MLflow, Prefect), showing their sizes; keeps .venv and pinned results
-	@"$$(test -x $(py) && echo $(py) || echo "$$PYTHON")" -m pipeline.shelf clean artifacts sweeps mlartifacts mlflow.db* .mlflow.lock .prefect \
+	@"$$(test -x $(py) && echo $(py) || echo "$$PYTHON")" -m pipeline.shelf clean artifacts sweeps comparisons mlartifacts mlflow.db* .mlflow.lock .prefect \
 		.warp .pytest_cache .ruff_cache .mypy_cache .hypothesis build *.egg-info

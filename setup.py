@@ -5,5 +5,9 @@ from setuptools import find_namespace_packages, setup
 setup(
     packages=[*find_namespace_packages(include=["physics3d*", "stages*", "pipeline*"]), "pipeline.conf"],
     package_dir={"pipeline.conf": "conf"},
-    package_data={"pipeline.conf": ["**/*.yaml"], "pipeline": ["pages/*"]},
+    package_data={
+        "pipeline.conf": ["**/*.yaml"],
+        "pipeline": ["pages/*"],
+        "physics3d.priors": ["tiny_video_weights/*"],  # made by make train-prior
+    },
 )

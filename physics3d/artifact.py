@@ -41,8 +41,7 @@ class AbstractArtifact:
         """Write the artifact into `folder`, made if missing. Raises ValueError from `check`, OSError on a full disk."""
         self.check()
         folder.mkdir(parents=True, exist_ok=True)
-        tensors: dict[str, torch.Tensor] = {}
-        tree = _encode(self, "", tensors, 0)
+        tree, tensors = encode(self)
         try:
             save_file(tensors, folder / ARRAYS)
         except SafetensorError as error:
@@ -59,7 +58,7 @@ class AbstractArtifact:
         except (OSError, ValueError, RecursionError, SafetensorError) as error:
             raise ArtifactError(f"{folder} does not hold a readable {cls.__name__}: {error}") from error
         try:
-            artifact = _decode(tree, tensors, (AbstractArtifact,), 0)
+            artifact = decode(tree, tensors)
             if not isinstance(artifact, cls):
                 raise ArtifactError(f"it holds a {type(artifact).__name__}")
             artifact.check()
@@ -73,6 +72,18 @@ def require_finite(name: str, value: torch.Tensor) -> None:
     bad = int((~torch.isfinite(value)).sum())
     if bad:
         raise ValueError(f"{name} holds {bad} non-finite numbers of {value.numel()}; repair or drop those entries")
+
+
+def encode(value: Any) -> tuple[Any, dict[str, torch.Tensor]]:
+    """(what JSON can hold, the tensors it names) of an artifact, or of numbers, text, None, tensors, arrays, artifacts,
+    and lists, tuples and tables of these. Raises TypeError for anything else."""
+    tensors: dict[str, torch.Tensor] = {}
+    return _encode(value, "", tensors, 0), tensors
+
+
+def decode(tree: Any, tensors: dict[str, torch.Tensor]) -> Any:
+    """The other way about. Raises ArtifactError for a class that is no artifact."""
+    return _decode(tree, tensors, (AbstractArtifact,), 0)
 
 
 def _encode(value: Any, path: str, tensors: dict[str, torch.Tensor], depth: int) -> Any:

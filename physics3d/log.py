@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 METRICS, PREVIEWS, LINES = "metrics.jsonl", "previews", "log.txt"
+CHECKPOINT = ".checkpoint"  # while it lasts (`checkpoint.py`)
 LINES_EVERY = 15.0  # between two lines of progress where there is no screen [s]
 
 
@@ -66,8 +67,9 @@ class Log:
         target.parent.mkdir(parents=True, exist_ok=True)
         return target
 
-    def progress(self, items: Iterable, description: str, total: int | None = None) -> Any:
-        """`items` behind a bar with an estimate; call `.set_postfix(loss=...)` on what is returned."""
+    def progress(self, items: Iterable | None, description: str, total: int | None = None, done: int = 0) -> Any:
+        """`items` behind a bar with an estimate; call `.set_postfix(loss=...)` on what is returned. None for items:
+        call `.update()`. `done`: how many of the `total` came before these, in a run that was stopped."""
         from tqdm import tqdm
 
         screen = sys.stderr.isatty()
@@ -75,6 +77,7 @@ class Log:
             items,
             desc=f"{self.name:>16} | {description}",
             total=total,
+            initial=done,
             disable=self.quiet,
             file=sys.stderr if screen else _Lines(),
             bar_format=None if screen else "{desc}: {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]",

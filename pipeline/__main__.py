@@ -22,7 +22,7 @@ from pipeline.flow import execute, up_to_date
 from pipeline.report import report
 from pipeline.settings import CONF, GROUPS, SettingsError, choices, compose, described
 from pipeline.shelf import using
-from pipeline.stage import Filed, StageError, here
+from pipeline.stage import Filed, StageError, Step, here
 from pipeline.tracking import Tracking, address, git_commit, mend
 from pipeline.words import literal_paths
 
@@ -95,6 +95,10 @@ def run(config: dict[str, Any], picked: dict[str, str], words: list[str], starte
     name, tags = title(picked, config, words)
     status, scores = "FAILED", {}
 
+    def begin(step: Step) -> None:
+        if tracking is not None:
+            tracking.begin(step)
+
     def done(filed: Filed) -> None:
         nonlocal tracking
         tracking = tracking or Tracking(output, config=config, name=name, tags=tags)
@@ -103,7 +107,7 @@ def run(config: dict[str, Any], picked: dict[str, str], words: list[str], starte
 
     try:
         with using(shelf):
-            plan, _ = execute(config, shelf, output / ".prefect", device(config["device"]), verify, done)
+            plan, _ = execute(config, shelf, output / ".prefect", device(config["device"]), verify, begin, done)
         scores = report(plan, hits)
         status = "FINISHED"
     except KeyboardInterrupt:

@@ -37,6 +37,7 @@ class Declared:
     defaults: dict[str, Any] = field(default_factory=dict)  # of the fields that need not be given; Any: made by code
     rules: tuple[Any, ...] = ()
     ranges: dict[str, Any] = field(default_factory=dict)  # of the parameters of a material
+    constants: dict[str, Any] = field(default_factory=dict)  # class variables with a value
     ancestors: frozenset[str] = frozenset()  # dotted names, its own among them
 
 
@@ -56,6 +57,7 @@ def declared(path: str) -> Declared:
     defaults = {k: v for parent in parents for k, v in parent.defaults.items()}
     rules = tuple(rule for parent in parents for rule in parent.rules)
     ranges: dict[str, Any] = {}
+    constants = {k: v for parent in parents for k, v in parent.constants.items()}
     is_dataclass = any("dataclass" in ast.dump(decorator) for decorator in node.decorator_list)
     for line in node.body:
         if isinstance(line, ast.Assign) and isinstance(line.targets[0], ast.Name):
@@ -63,15 +65,19 @@ def declared(path: str) -> Declared:
                 rules += tuple(_value(line.value, module))
             if line.targets[0].id == "RANGES":
                 ranges = _value(line.value, module)
-        elif is_dataclass and isinstance(line, ast.AnnAssign) and isinstance(line.target, ast.Name):
+        elif isinstance(line, ast.AnnAssign) and isinstance(line.target, ast.Name):
             hint = _value(line.annotation, module)
             if typing.get_origin(hint) is typing.ClassVar:
+                if line.value is not None:
+                    constants[line.target.id] = _value(line.value, module)
+                continue
+            if not is_dataclass:
                 continue
             hints[line.target.id] = hint
             if line.value is not None:
                 defaults[line.target.id] = _value(line.value, module)
     ancestors = frozenset({path}.union(*(parent.ancestors for parent in parents)))
-    return Declared(name, hints, defaults, rules, ranges, ancestors)
+    return Declared(name, hints, defaults, rules, ranges, constants, ancestors)
 
 
 def classes(module: str) -> list[str]:

@@ -22,7 +22,7 @@ def main(words: list[str], environment: Mapping[str, str]) -> int:
 
 def film(words: list[str], environment: Mapping[str, str]) -> None:
     """Raises SettingsError, StageError, ValueError, RuntimeError or OSError with one line."""
-    width, height = _size(environment.get("SIZE") or "1280x720")
+    width, height = size_of(environment.get("SIZE") or "1280x720")
     seconds = _seconds(environment.get("LENGTH") or "")
 
     import torch
@@ -54,7 +54,8 @@ def film(words: list[str], environment: Mapping[str, str]) -> None:
     print(f"written   {target}   {count / fps:.1f} s, {megabytes(size)}")
 
 
-def _size(text: str) -> tuple[int, int]:
+def size_of(text: str) -> tuple[int, int]:
+    """Width and height [px]. Raises SettingsError."""
     found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
     width, height = (int(found[1]), int(found[2])) if found else (0, 0)
     if not all(2 <= side <= LARGEST and side % 2 == 0 for side in (width, height)):

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from pipeline.fields import declared
 from pipeline.page import STAGES
 from pipeline.server import server
 from pipeline.stage import Filed, Part, StageError, Step, Unknown, as_task, build, damage, load, peek, usual_seconds
@@ -54,6 +55,9 @@ def plan(config: dict[str, Any], capture: Step, ask: bool = True, found: dict[st
     gaussians = capture.part("gaussians") if "reconstruct" in without else step("reconstruct", capture)
     segmentation = None if "segment" in without else step("segment", capture, gaussians)
     body = step("fill", capture, gaussians, segmentation)
+    if _recorded(found) and (config["learn"] or {}).get("imagined"):
+        # what would be imagined without a recording is nothing to learning from one
+        config = config | {"learn": config["learn"] | {"imagined": None}}
     estimate = guess if "learn" in without else step("learn", capture, gaussians, body)
     trajectory = step("simulate", body, estimate)
     video = step("render", capture, gaussians, body, trajectory)
@@ -85,8 +89,8 @@ def left_out(config: dict[str, Any], capture: dict[str, Any], shelf: Path) -> di
         why["segment"] = "the scene is a single object"
     elif not capture.get("images", True):
         why["segment"] = "the scene has no photographs, and says itself what moves"
-    if "learn" not in roles:
-        why.setdefault("learn", "the scene has no recorded motion to learn from")
+    if not _recorded(capture) and config.get("learn") is not None and _needs_clip(config["learn"].get("prior")):
+        why["learn"] = "the scene has no recorded motion to learn from, and the prior knows no other"
     if not roles:
         why["evaluate"] = "the scene has no recorded motion to compare with"
     if _unknown(capture):
@@ -96,6 +100,16 @@ def left_out(config: dict[str, Any], capture: dict[str, Any], shelf: Path) -> di
         if usual is not None:
             why[name] += f"; it took {usual:.0f} s in other runs here"
     return why
+
+
+def _recorded(capture: dict[str, Any]) -> bool:
+    """Whether there is a motion to learn from."""
+    return any(take["role"] == "learn" for take in capture["takes"])
+
+
+def _needs_clip(prior: dict[str, Any] | None) -> bool:
+    """Whether a prior knows nothing but recordings, as its source says."""
+    return prior is None or bool(declared(prior["_target_"]).constants["needs_clip"])
 
 
 def _unknown(capture: dict[str, Any]) -> bool:
@@ -116,9 +130,16 @@ def up_to_date(config: dict[str, Any], shelf: Path, verify: bool) -> Plan | None
 
 
 def execute(
-    config: dict[str, Any], shelf: Path, home: Path, device: str, verify: bool, done: Callable[[Filed], None]
+    config: dict[str, Any],
+    shelf: Path,
+    home: Path,
+    device: str,
+    verify: bool,
+    begin: Callable[[Step], None],
+    done: Callable[[Filed], None],
 ) -> tuple[Plan, list[Filed]]:
-    """Run the graph under Prefect; `done` is called after each step. Raises StageError with one line."""
+    """Run the graph under Prefect; `begin` is called before each step that is computed, `done` after every one. Raises
+    StageError with one line."""
 
     stages: dict[str, Any] = {}
     with server(home, meanwhile=lambda: stages.update(built(config, device))):
@@ -129,6 +150,8 @@ def execute(
             filed: dict[Step, Filed] = {}
 
             def compute(step: Step) -> None:
+                if damage(step, verify):
+                    begin(step)
                 filed[step] = as_task(step, device, verify)([filed[s] for s in before(step)])
                 done(filed[step])
 

@@ -30,7 +30,7 @@ PLAIN = {  # entries that belong to no class
     "use": {name: Key | None for name in STEPS},
 }
 USED_BY_STAGES = {  # entries that stages take over; those of a class are checked there
-    "": ("world", "material", "prior", "masker", "densification", "solid", *STAGES),
+    "": ("world", "material", "prior", "estimator", "masker", "densification", "solid", *STAGES),
     "scene": [
         "source",
         "camera_distance",
@@ -168,7 +168,7 @@ def _between(config: dict[str, Any]) -> Iterator[str]:
     with suppress(Unknown):
         known = declared(source["_target_"])
         filmed = (known.defaults | source).get("frames") if {"frames", "fps"} <= set(known.hints) else None  # a twin
-        if learn and filmed and learn["frames"] > filmed:
+        if learn and filmed and (learn["frames"] or 0) > filmed:
             yield f"learn.frames is {learn['frames']}; take at most the {filmed} of a take (scene.source.frames)"
     force, excitation = config["simulate"].get("force"), config["simulate"].get("excitation", ())
     if force and any(force.values()) and not any(push.get("force") for push in excitation):

@@ -73,7 +73,7 @@ def headline(plan: Plan) -> dict[str, float]:
     """Learned parameters with their intervals, and scores, of a plan whose steps are all filed, by name."""
     found: dict[str, float] = {}
     for p in told.parameters(plan):
-        for side, value in (("learned", p.learned), ("low", p.low), ("high", p.high)):
+        for side, value in (("learned", p.learned), ("learned_low", p.low), ("learned_high", p.high)):
             if value is not None:
                 found[f"{side}/{p.name}"] = value
     for judged in told.scores(plan):

@@ -11,7 +11,7 @@ from pipeline.page import nearest, problem, set_by
 
 INSTALLED = Path(__file__).resolve().parent / "conf"
 CONF = INSTALLED if INSTALLED.is_dir() else ROOT / "conf"  # beside the packages in a checkout, inside of one in a wheel
-GROUPS = ("scene", "material", "prior", "masker", "densification", "solid", "method", "profile")
+GROUPS = ("scene", "material", "prior", "estimator", "masker", "densification", "solid", "method", "profile")
 
 
 class SettingsError(ValueError):

@@ -101,7 +101,9 @@ def collect(output: Path) -> None:
                 print(f"{_words(size):>10}  {path}")
                 _remove(path, set())
                 gone, total = gone + 1, total + size
-    print(f"{_words(total):>10}  removed: {gone} results that no run refers to; {len(keep)} are kept")
+    print(
+        f"{_words(total):>10}  removed: {gone} results, whole or half-done, that no run refers to; {len(keep)} are kept"
+    )
 
 
 def referred(record: Path) -> set[str]:

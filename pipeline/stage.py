@@ -4,7 +4,7 @@ The result is a folder artifacts/<stage>/<fingerprint>/ with the artifact, what 
 (size and sha256 of every file, configuration, time, memory, versions). It is written under a hidden name beside its
 place, flushed to the disk and renamed: whatever kills the run, nothing half-done looks finished. A lock per artifact
 (released by the system when its holder dies) makes a second run wait and then reuse; whoever holds the lock sweeps what
-dead runs left behind.
+dead runs left behind, but for stages that keep checkpoints (`physics3d/checkpoint.py`): these go on from the last one.
 """
 
 import difflib
@@ -100,6 +100,11 @@ class Step:
     def folder(self) -> Path:
         return self.shelf / self.stage / self.fingerprint
 
+    @property
+    def unfinished(self) -> Path:
+        """Where the artifact is written until it is whole."""
+        return self.folder.with_name(f".{self.fingerprint}")
+
     def part(self, field: str) -> "Part":
         return Part(self, field)
 
@@ -154,6 +159,11 @@ def damage(step: Step, verify: bool = False) -> str | None:
     except (OSError, ValueError) as error:
         return str(error) or "unreadable"
     return None
+
+
+def half_done(step: Step) -> bool:
+    """Whether a run would go on from a checkpoint of this step."""
+    return _left(step.unfinished)
 
 
 def spoilt(step: Step, reason: str) -> StageError:
@@ -327,34 +337,39 @@ def strange(step: Step) -> str | None:
 
 
 def _compute(step: Step, device: str, verify: bool) -> dict[str, Any]:
-    from physics3d.log import Log
+    from physics3d.log import CHECKPOINT, LINES, PREVIEWS, Log
 
-    temporary = step.folder.with_name(f".{step.fingerprint}")
+    temporary = step.unfinished
     try:
-        temporary.mkdir(parents=True)
+        temporary.mkdir(parents=True, exist_ok=True)
+        for path in temporary.iterdir():  # a checkpoint has the curves; what else was left is written anew
+            if path.name not in (CHECKPOINT, LINES, PREVIEWS):
+                _remove(path)
         log = Log(temporary, name=step.name)
         stage = build(step.config, device, step.name)
         inputs = [load(source, device, verify) for source in step.inputs]
         _reset_peak()
-        started = time.monotonic()
+        log.started = time.monotonic()
         artifact = stage(*inputs, log=log)
-        seconds = time.monotonic() - started
+        seconds = time.monotonic() - log.started  # with those before a checkpoint
         artifact.save(temporary)
         manifest = _describe(step, device) | {"seconds": seconds, "peak_rss_bytes": _peak(), "files": _list(temporary)}
         (temporary / MANIFEST).write_text(json.dumps(manifest, indent=1, default=str))
         _flush(temporary)
         _remove(step.folder)  # damaged
+        for path in temporary.glob(f"{CHECKPOINT}*"):
+            path.unlink()
         temporary.rename(step.folder)
         _flush_entry(step.folder.parent)
         return manifest
     except StageError:
-        shutil.rmtree(temporary, ignore_errors=True)
+        _drop(temporary)
         raise
     except Exception as error:
         kept = _keep(step, temporary)
         raise StageError(f"{step.name}: {_one_line(error)}{f' (traceback: {kept})' if kept else ''}") from error
     except BaseException:  # Ctrl-C
-        shutil.rmtree(temporary, ignore_errors=True)
+        _drop(temporary)
         raise
 
 
@@ -381,7 +396,7 @@ def _keep(step: Step, temporary: Path) -> Path | None:
     except OSError:
         return None
     finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        _drop(temporary)
     return kept
 
 
@@ -410,9 +425,11 @@ def _lock(step: Step, wait: bool) -> Iterator[bool]:
 
 
 def _sweep(step: Step) -> None:
-    """Remove unfinished folders of this stage whose writers are gone."""
+    """Remove unfinished folders of this stage whose writers are gone, but for those with a checkpoint to go on from."""
     for folder in (step.shelf / step.stage).glob(".*"):
         key = folder.name[1:]
+        if _left(folder):
+            continue
         if key == step.fingerprint:  # we hold its lock
             _remove(folder)
             continue
@@ -421,6 +438,19 @@ def _sweep(step: Step) -> None:
             if mine:
                 with suppress(OSError):
                     _remove(folder)
+
+
+def _left(folder: Path) -> bool:
+    """Whether a stage that was stopped left a checkpoint in its unfinished folder."""
+    from physics3d.log import CHECKPOINT
+
+    return not folder.is_symlink() and (folder / CHECKPOINT).is_file()
+
+
+def _drop(temporary: Path) -> None:
+    """Remove what a stage has written so far, unless it can go on from there."""
+    if not _left(temporary):
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _remove(path: Path) -> None:
@@ -489,8 +519,8 @@ def _describe(step: Step, device: str) -> dict[str, Any]:
 
 
 def _list(folder: Path) -> dict[str, tuple[int, str]]:
-    """Name -> size [byte] and sha256 of every file in a folder."""
-    paths = sorted(p for p in folder.rglob("*") if p.is_file())
+    """Name -> size [byte] and sha256 of every file in a folder that is not hidden."""
+    paths = sorted(p for p in folder.rglob("[!.]*") if p.is_file())
     return {p.relative_to(folder).as_posix(): (p.stat().st_size, file_digest(p)) for p in paths}
 
 

@@ -154,6 +154,11 @@ def _crew(own: dict[str, str], most: int) -> Crew:
 
 def run(crew: Crew, variants: list[Variant]) -> int:
     """Compute what is not filed yet, record every variant as it ends, and show the table."""
+    return 0 if all(row["state"] == "done" for row in swept(crew, variants).values()) else 1
+
+
+def swept(crew: Crew, variants: list[Variant]) -> dict[Variant, dict[str, Any]]:
+    """The same; the rows of the table, of each variant its `state`, done or what went wrong, and its numbers."""
     output = Path(variants[0].config["output"]).expanduser().resolve()
     shelf, name = output / "artifacts", time.strftime("%Y%m%d-%H%M%S")
     output.mkdir(parents=True, exist_ok=True)
@@ -195,7 +200,7 @@ def run(crew: Crew, variants: list[Variant]) -> int:
     print(f"table     {table}")
     if (output / "mlflow.db").exists():
         print(f"all runs  make ui, or {address(output, sweep=name)}")
-    return 0 if all(row["state"] == "done" for row in rows.values()) else 1
+    return rows
 
 
 def compute(crew: Crew, variants: list[Variant], shelf: Path, done: Callable) -> None:

@@ -41,7 +41,8 @@ class Parameter:
     def between(self) -> str:
         """The interval in words; of what was not learned, that."""
         if self.learned is None or self.low is None or self.high is None:
-            return "as given"
+            given = self.learned is None or math.isclose(self.learned, self.start, rel_tol=1e-6)  # filed in float32
+            return "as given" if given else "no interval is known"
         words = f"between {self.low:.4g} and {self.high:.4g}"
         return words if self.determined else f"not determined by this clip; {words}"
 

@@ -1,6 +1,6 @@
-"""MLflow: one run per flow, one nested run per stage, replayed from what the stage left in its artifact.
+"""MLflow: one run per flow, one nested run per stage, with what the stage tells while it runs and what it leaves.
 
-A stage that was reused is replayed too (tag cache=hit), so that every run shows all curves and previews. What people
+A stage that was reused is replayed (tag cache=hit), so that every run shows all curves and previews. What people
 compare stands on the parent: headline numbers, seconds per stage (`time/<step>_s`), which of them were reused
 (tag `cache/<step>`), videos, plots, and the load of the machine. The learned material is an object of its own, a logged
 model with its parameters and scores as metrics, so that all materials of all runs can be put in an order. Tracking may
@@ -15,7 +15,6 @@ MLflow, only SQLite.
 """
 
 import fcntl
-import json
 import logging
 import os
 import re
@@ -31,13 +30,12 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from pipeline.stage import Filed
+from pipeline.live import NUMBERED, Live, metric_name
+from pipeline.stage import Filed, Step
 
 EXPERIMENT = "physics3d"
 KIND = {"mlflow.experimentKind": "custom_model_development"}  # else the page may open on tools for chats and traces
 SHOWN = ("learn", "render", "foretell", "evaluate")  # steps whose videos and plots are attached to the parent as well
-NUMBERED = re.compile(r"(.+)_(\d{5})")  # a preview of a step
-BATCH = 1000  # metrics per request that MLflow takes; 100 for parameters
 
 
 class Tracking:
@@ -50,10 +48,15 @@ class Tracking:
         self.seconds = {"all": 0.0, "computed": 0.0}  # of the steps, and of those that this run computed
         self.learned: Filed | None = None
         self.load: Any = None  # what records the load of the machine
+        self.live: Live | None = None  # what the step at work tells
         self._attempt(lambda: self._open(config, name, tags))
 
+    def begin(self, step: Step) -> None:
+        """Open the nested run of a step that is about to be computed, and have it show what the step tells."""
+        self._attempt(lambda: self._begin(step))
+
     def stage(self, filed: Filed) -> None:
-        """Replay a filed step as a nested run."""
+        """Show in a nested run what a step has left, as far as it was not shown while it ran."""
         self._attempt(lambda: self._replay(filed))
 
     def close(self, *, scores: dict[str, float], status: str) -> None:
@@ -95,31 +98,30 @@ class Tracking:
         self.load = SystemMetricsMonitor(self.run, tracking_uri=database(self.output))
         self.load.start()
 
-    def _replay(self, filed: Filed) -> None:
-        from mlflow.entities import Metric
+    def _begin(self, step: Step) -> None:
+        self.live = Live(self.client, self._nested(step))
+        self.live.follow(step.unfinished)
 
-        step, folder = filed.step, filed.step.folder
-        cache = "taken" if step.taken else "hit" if filed.hit else "miss"
+    def _nested(self, step: Step) -> str:
         tags = {
             "mlflow.parentRunId": self.run,
             "stage": step.stage,
-            "cache": cache,
             "key": step.fingerprint,
-            "artifact": os.path.relpath(folder, self.output),
+            "artifact": os.path.relpath(step.folder, self.output),
             "process": _process(os.getpid()),
         }
-        run = self.client.create_run(self.experiment, run_name=step.name, tags=tags).info.run_id
-        now = int(time.time() * 1000)
-        metrics = [Metric("seconds", filed.manifest["seconds"], now, 0)]
-        metrics.append(Metric("peak_rss_gb", filed.manifest["peak_rss_bytes"] / 1e9, now, 0))
-        lines = folder / "metrics.jsonl"
-        for line in lines.read_text().splitlines() if lines.is_file() else []:
-            point = json.loads(line)
-            metrics.append(Metric(_name(point["name"]), point["value"], now, point["step"] or 0))
-        for i in range(0, len(metrics), BATCH):
-            self.client.log_batch(run, metrics=metrics[i : i + BATCH])
-        for path in sorted((folder / "previews").glob("*.png")):
-            self._preview(run, path)
+        return self.client.create_run(self.experiment, run_name=step.name, tags=tags).info.run_id
+
+    def _replay(self, filed: Filed) -> None:
+        step, folder = filed.step, filed.step.folder
+        cache = "taken" if step.taken else "hit" if filed.hit else "miss"
+        live, self.live = self.live or Live(self.client, self._nested(step)), None
+        live.end()
+        live.send(folder)
+        run = live.run
+        self.client.set_tag(run, "cache", cache)
+        self.client.log_metric(run, "seconds", filed.manifest["seconds"])
+        self.client.log_metric(run, "peak_rss_gb", filed.manifest["peak_rss_bytes"] / 1e9)
         for path in [*sorted(folder.glob("*.mp4")), folder / "manifest.json", folder / "log.txt"]:
             if path.is_file():
                 self.client.log_artifact(run, str(path))
@@ -137,19 +139,12 @@ class Tracking:
         if step.name == "learn":
             self.learned = filed
 
-    def _preview(self, run: str, path: Path) -> None:
-        """Numbered previews become one picture with a slider over steps, the others plain files."""
-        numbered = NUMBERED.fullmatch(path.stem)
-        if not numbered:
-            self.client.log_artifact(run, str(path), "previews")
-            return
-        from PIL import Image
-
-        self.client.log_image(run, Image.open(path), key=numbered[1], step=int(numbered[2]))
-
     def _close(self, scores: dict[str, float], status: str) -> None:
+        if self.live is not None:  # of the step that failed, or was interrupted
+            self.live.end()
+            self.client.set_terminated(self.live.run, status)
         for key, value in scores.items():
-            self.client.log_metric(self.run, _name(key), value)
+            self.client.log_metric(self.run, metric_name(key), value)
         for key, seconds in self.seconds.items():
             self.client.log_metric(self.run, f"time/{key}_s", seconds)
         if self.load is not None:
@@ -178,7 +173,7 @@ class Tracking:
                 self.client.log_model_artifact(made.model_id, str(step.folder / name))
         for key, value in scores.items():
             if key.startswith(("learned/", "score/learned/")):
-                self.client.log_metric(self.run, _name(key), value, model_id=made.model_id)
+                self.client.log_metric(self.run, metric_name(key), value, model_id=made.model_id)
         self.client.finalize_logged_model(made.model_id, "READY")
         self.client.log_outputs(self.run, [LoggedModelOutput(made.model_id, step=0)])
 
@@ -386,11 +381,6 @@ def free_port(port: str, command: str = "make ui") -> int:
             taken = f"port {port} cannot be served ({error.strerror}); is `{command}` running elsewhere?"
             raise ValueError(f"{taken} {remedy}") from error
     return int(port)
-
-
-def _name(text: str) -> str:
-    """MLflow takes letters, digits, _ - . / and spaces in names."""
-    return re.sub(r"[^\w\-. /]", "_", text)
 
 
 def main(words: list[str]) -> int:

@@ -16,7 +16,18 @@ from typing import Any
 
 from pipeline.flow import Plan, first, plan
 from pipeline.settings import SettingsError, compose
-from pipeline.stage import MANIFEST, StageError, Step, Unknown, damage, peek, read_manifest, spoilt, usual_seconds
+from pipeline.stage import (
+    MANIFEST,
+    StageError,
+    Step,
+    Unknown,
+    damage,
+    half_done,
+    peek,
+    read_manifest,
+    spoilt,
+    usual_seconds,
+)
 from pipeline.tracking import flatten
 from pipeline.words import literal_paths
 
@@ -54,7 +65,8 @@ def explain(config: dict[str, Any], shelf: Path) -> Iterator[str]:
         waiting += 1
         usual = usual_seconds(shelf, step.stage)
         seconds += usual or 0.0
-        yield f"{step.name:>16} | would run{f' ({usual:.0f} s in other runs here)' if usual is not None else ''}"
+        begun = ", from where it was stopped" if half_done(step) else ""
+        yield f"{step.name:>16} | would run{begun}{f' ({usual:.0f} s in other runs here)' if usual is not None else ''}"
         lines = [f"the stored result is damaged ({reason})"] if os.path.lexists(step.folder) else changes(step)
         yield from (f"{'':>16} |   {line}" for line in lines[:SHOWN])
         if len(lines) > SHOWN:
@@ -64,7 +76,8 @@ def explain(config: dict[str, Any], shelf: Path) -> Iterator[str]:
     if guessed:
         yield f"{'':>16} | {guessed}"
     if waiting and len(whole.steps) > 1:
-        yield f"{waiting} of {len(whole.steps)} steps would run; those here took {seconds:.0f} s in other runs"
+        known = f"; those that have run here before took {seconds:.0f} s" if seconds else ""
+        yield f"{waiting} of {len(whole.steps)} steps would run{known}"
     elif not waiting:
         yield f"up to date: all {len(whole.steps)} steps were computed before"
 

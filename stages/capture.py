@@ -1,12 +1,19 @@
-"""The first stage: whatever the scene's source is -> a Capture, with pictures of what was read."""
+"""The first stage: whatever the scene's source is -> a Capture, with pictures of what was read.
 
-from dataclasses import dataclass
+To any source a clip may be added that somebody, or a video model, made of the picture that `make still` writes: it is
+seen by a camera that is known, and by a push that is not.
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from physics3d.checks import Text, Whole, require_fields
 from physics3d.pictures import contact_sheet
 from physics3d.scenes.base import AbstractSource, Capture
+from physics3d.scenes.clips import clip_files, filmed_takes
 from physics3d.video import write_mp4
 
 
@@ -15,9 +22,21 @@ class LoadCapture:
     """Call the source, say what came back, and keep previews of the views and of every take."""
 
     source: AbstractSource
+    clip: Text | None = None  # file of a motion seen from `view`, learned from in the place of the source's own takes
+    view: Whole | Text | None = None  # index or name of the photograph whose camera sees it; None: the first one
+
+    def __post_init__(self):
+        require_fields(self, "capture")
+
+    def files(self) -> tuple[str, ...]:
+        """The clip; the source says itself what it reads."""
+        return () if self.clip is None else tuple(map(str, clip_files(Path(self.clip))))
 
     def __call__(self, *, log) -> Capture:
+        """Raises ValueError as the source does, and for a clip that cannot be used."""
         capture = self.source(log=log)
+        if self.clip is not None:
+            capture = self.with_clip(capture, log)
         capture.check()
         if capture.note:
             log.info(capture.note)
@@ -41,6 +60,18 @@ class LoadCapture:
             if log.folder is not None:
                 write_mp4(log.path(f"previews/take_{take.name}.mp4"), take.videos[0], take.fps)
         return capture
+
+    def with_clip(self, capture: Capture, log) -> Capture:
+        """The capture with the clip as its only take."""
+        assert self.clip is not None
+        (take, *more) = filmed_takes(Path(self.clip), log=log)
+        if more:
+            raise ValueError(f"capture.clip is {self.clip}, a folder of {1 + len(more)} clips; name one of them")
+        h, w = take.video.shape[1:3]
+        camera = capture.seen_from(self.view, key="render.view").framed(w, h)
+        if capture.takes:
+            log.info(f"left out, for a clip is learned from: {', '.join(t.name for t in capture.takes)}")
+        return replace(capture, takes=(take.seen_by(camera),))
 
 
 def _same_size(images: tuple[Tensor, ...]) -> Tensor:

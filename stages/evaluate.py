@@ -8,6 +8,7 @@ import numpy as np
 from torch import Tensor
 
 from physics3d.boundaries.base import AbstractBoundary
+from physics3d.boundaries.impulse import Force, excited
 from physics3d.log import Log
 from physics3d.metrics.against import Reference
 from physics3d.metrics.comparable import matched, same, shrink
@@ -17,7 +18,6 @@ from physics3d.metrics.scores import FROZEN, REFERENCE, Scores
 from physics3d.scenes.base import Capture
 from physics3d.video import Video
 from physics3d.world import Estimate
-from stages.simulate import Force, excited
 
 DIFFERENT = "the simulated excitation is not the one that was filmed: only the eye may compare"
 

@@ -1,5 +1,5 @@
 """Particles + video prior -> material: score distillation through renderer and simulator
-(`physics3d/learning/fit.py`)."""
+(`physics3d/learning/fit.py`), from a recorded motion, or from an imagined one where the prior needs no recording."""
 
 import dataclasses
 import math
@@ -31,22 +31,27 @@ from physics3d.gaussians.model import Gaussians
 from physics3d.learning.chain import chain_of
 from physics3d.learning.course import Point, history
 from physics3d.learning.curves import curves
-from physics3d.learning.fields import AXES, GlobalField, physical
+from physics3d.learning.fields import AXES, AbstractField, GlobalField, physical
 from physics3d.learning.fit import fit
+from physics3d.learning.imagined import Imagined
 from physics3d.learning.interval import Beyond, intervals, is_stiff, posterior, words
 from physics3d.learning.linear import Shown, shown
 from physics3d.learning.loss import Chain
 from physics3d.learning.polish import polish
 from physics3d.learning.search import search
+from physics3d.learning.stiffness_field import WIDTH, StiffnessField, asked_for, is_node, picture, trilinear
 from physics3d.learning.unknown_cause import learned_free
 from physics3d.log import Log
 from physics3d.pictures import contact_sheet, to_uint8
 from physics3d.priors.base import AbstractPrior
+from physics3d.priors.estimators.base import AbstractEstimator
+from physics3d.priors.estimators.sds import ScoreDistillation
 from physics3d.scenes.base import Capture, Footage, Outline
 from physics3d.world import Estimate, Interval, World
 
 Span = Annotated[float, Gt(1), Le(1e12)]  # a factor
 Width = Annotated[float, Gt(0), Le(20)]
+USUAL_FRAMES = 15  # of a clip, for priors that take any number
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,6 +60,7 @@ class Learn:
 
     world: World
     prior: AbstractPrior
+    estimator: AbstractEstimator = dataclasses.field(default_factory=ScoreDistillation)
     learn: tuple[Text, ...]  # parameters that may change; the others keep the value of world.start
     ties: tuple[
         tuple[Text, ...], ...
@@ -64,7 +70,9 @@ class Learn:
     polish: Whole = 0  # Levenberg steps after the descent; one costs a forward run per parameter and two
     learning_rate: Annotated[float, Gt(0), Le(10)] = 0.1  # first step of theta: 0.1 is ten per cent of a parameter
     duration: Duration | None = None  # only the first part of the take is used [s]; None: all of it
-    frames: Frames = 15  # of the take, spread over the duration
+    # of the take, spread over the duration; None: as many as the prior was trained on, USUAL_FRAMES if it takes any
+    frames: Frames | None = None
+    imagined: Imagined | None = None  # the motion to learn from where none was recorded
     frames_per_step: Whole = 0  # drawn anew for each step, spread over all of them; 0: all (diffusion priors need all)
     views_per_step: Whole = 1  # cameras drawn anew for each step; 0: all; held-out cameras are never used
     image_scale: Annotated[float, Gt(0), Le(16)] = 0.5  # pixels rendered per pixel of the take, along each side
@@ -79,6 +87,8 @@ class Learn:
     beyond: Beyond = dataclasses.field(default_factory=Beyond)  # widths of what the clip does not show
     largest_gradient: Positive = 3.0  # clip of the global norm, in units of the loss at the start per unit of theta
     zones: Annotated[int, Ge(1), Le(16)] = 4  # of stiffness, where the cause of the motion is unknown
+    # of a field of stiffness, along the body's longest side; taken where the clip asks for it. 0: one stiffness
+    nodes: Literal[0] | Annotated[int, Ge(2), Le(32)] = 0
     device: Device = "cpu"
     seed: Seed = 0
 
@@ -94,17 +104,25 @@ class Learn:
         self.field(self.world.estimate(), speed=1.0)
 
     def fits(self, outline: Outline) -> None:
-        """Raise ValueError if a take of this outline is too short, as far as that is known."""
-        for take in outline.takes or ():
-            if take.role == "learn":
-                self.spread(take)
+        """Raise ValueError if a take of this outline is too short, or the prior too large for its device, as far as
+        that is known."""
+        recorded = [take for take in outline.takes or () if take.role == "learn"]
+        if not recorded and outline.takes is not None and self.imagined is not None and not self.prior.needs_clip:
+            recorded = [self.imagined.footage]
+        for take in recorded:
+            if memory := self.prior.memory(len(self.spread(take))):
+                memory.require()
 
     def __call__(self, capture: Capture, gaussians: Gaussians, body: Body, *, log: Log) -> Estimate:
         """Raises ValueError if there is no take to learn from, or a name, frame count or camera does not fit."""
         take = capture.take("learn")
+        if take is None and self.imagined is not None and not self.prior.needs_clip:
+            falls = any(self.world.gravity) or any(self.world.velocity)
+            take = self.imagined.take(capture, gaussians, falls=falls, device=self.device)
         if take is None:
             raise ValueError(
-                f"capture {capture.name} has no take with role learn; leave out the learning, or record a motion"
+                f"capture {capture.name} has no take with role learn; leave out the learning, record a motion, or take "
+                "a prior that needs none"
             )
         if take.excitation is None:
             width = self.guess_widths.get("youngs_modulus", self.guess_width)
@@ -116,67 +134,100 @@ class Learn:
         start = self.world.estimate()
         section = look_ahead(body, self.world, take.excitation, log)
         indices = self.spread(take.footage)
+        if memory := self.prior.memory(len(indices)):
+            log.info(f"the prior takes {memory.require()}")
         seconds = int(indices[-1]) / take.fps
-        field = self.field(start, speed=self.natural_speed(body, seconds))
-        chain = chain_of(
-            self.world,
-            self.prior,
-            field,
-            capture,
-            gaussians,
-            body,
-            take,
-            indices,
-            image_scale=self.image_scale,
-            device=self.device,
-            log=log,
-        )
-        log.info(
-            f"learning {', '.join(field.names)} from take {take.name}: {len(indices)} frames over {seconds:.2f} s, "
-            f"{len(chain.clips)} camera(s), {len(body.position)} particles"
-        )
-        theta = field.zero()
-        course: list[Point] = []
-        if self.search:
-            theta, course = self.searched(chain, field, log)
-        if self.steps:
-            theta, descent = fit(
-                chain,
+        whole = self.field(start, speed=self.natural_speed(body, seconds))
+
+        def chained(field: AbstractField, log: Log) -> Chain:
+            return chain_of(
+                self.world,
+                self.prior,
+                self.estimator,
                 field,
-                theta,
-                steps=self.steps,
-                learning_rate=self.learning_rate,
-                views_per_step=self.views_per_step,
-                frames_per_step=self.frames_per_step,
-                stay=self.stay,
-                largest_gradient=self.largest_gradient,
-                seed=self.seed,
+                capture,
+                gaussians,
+                body,
+                take,
+                indices,
+                image_scale=self.image_scale,
+                device=self.device,
                 log=log,
             )
+
+        chain = chained(whole, log)
+        trained = self.prior.trained_frames
+        if trained not in (None, len(indices)):
+            log.warn(f"{len(indices)} frames are shown to a prior that was trained on clips of {trained}")
+        log.info(
+            f"learning {', '.join(whole.names)} from take {take.name}: {len(indices)} frames over {seconds:.2f} s, "
+            f"{len(chain.clips)} camera(s), {len(body.position)} particles"
+        )
+        theta = whole.zero()
+        course: list[Point] = []
+        if self.search:
+            theta, course = self.searched(chain, whole, log)
+        if self.steps:
+            theta, descent = self.descended(chain, whole, theta, log)
             course += descent
-        if self.polish:
-            theta, polished = polish(chain, field, theta, steps=self.polish, stay=self.stay, seed=self.seed, log=log)
+        if self.polish and not chain.comparable:
+            log.info("no polish: single losses of this prior and estimator cannot be compared")
+        elif self.polish:
+            theta, polished = polish(chain, whole, theta, steps=self.polish, stay=self.stay, seed=self.seed, log=log)
             course += polished
-        seen = shown(chain, field, theta, seed=self.seed)
+        seen = shown(chain, whole, theta, seed=self.seed) if chain.certain else None
+        field: AbstractField = whole
+        known = history(whole, course)
+        if self.nodes and seen is None:
+            log.info("no field of stiffness: residuals tell whether a clip asks for one, and this prior has none")
+        elif self.nodes and seen is not None:
+            finer = StiffnessField(whole=whole, weights=trilinear(body.position, self.nodes))
+            over, more = replace(chained(finer, Log(None)), journal=chain.journal), finer.zero()
+            more[: len(theta)] = theta
+            more, descent = self.descended(over, finer, more, log)
+            if self.polish and over.comparable:
+                more, polished = polish(over, finer, more, steps=self.polish, stay=self.stay, seed=self.seed, log=log)
+                descent += polished
+            losses = chain.measure(theta, self.seed), over.measure(more, self.seed)
+            if asked_for(losses, finer, seen.evidence, log):
+                field, theta, chain, seen = finer, more, over, shown(over, finer, more, seed=self.seed)
+                known = {name: [*known.get(name, []), *curve] for name, curve in history(finer, descent).items()}
         learned = replace(
             start,
             parameters={name: v.detach().to(torch.float32) for name, v in field.parameters(theta).items()},
             velocity=field.velocity(theta).detach().to(torch.float32),
-            history=history(field, course),
-            intervals=self.intervals(field, theta, seen, section, log),
+            history=known,
+            intervals=self.intervals(field, theta, seen, section, log) if seen else {},
         )
         self.report(capture, field, learned, seen, log)
         if log.folder is not None:
+            if isinstance(field, StiffnessField):
+                log.image("stiffness", picture(body.position, learned.parameters))
             if course:
                 log.image("parameters", curves(capture, learned))
-            frames = torch.arange(len(indices))
             with torch.no_grad():
                 view = next(iter(chain.clips))
-                clip = chain.render(chain.simulate(theta), view, frames)
+                clip = chain.render(chain.simulate(theta), view, chain.frames)
             log.image(
                 "reference_above_learned", contact_sheet(to_uint8(torch.cat([chain.clips[view], clip], 1)), columns=5)
             )
         return learned
+
+    def descended(self, chain: Chain, field: AbstractField, theta: Tensor, log: Log) -> tuple[Tensor, list[Point]]:
+        """Where gradient descent ends, and its course."""
+        return fit(
+            chain,
+            field,
+            theta,
+            steps=self.steps,
+            learning_rate=self.learning_rate,
+            views_per_step=self.views_per_step,
+            frames_per_step=self.frames_per_step,
+            stay=self.stay,
+            largest_gradient=self.largest_gradient,
+            seed=self.seed,
+            log=log,
+        )
 
     def spread(self, take: Footage) -> Tensor:
         """Which frames of the take are used: the first, and others spread over all of the duration.
@@ -185,15 +236,21 @@ class Learn:
         total = take.frames
         if self.duration is not None:
             total = min(total, math.floor(self.duration * take.fps + 1e-6) + 1)
-        if self.frames > total:
+        count, why = self.frames, ""
+        if count is None:
+            count = self.prior.trained_frames
+            why = " (null: as many as the prior was trained on)" if count else ""
+            count = count or min(USUAL_FRAMES, total)
+        if count > total:
             raise ValueError(
-                f"learn.frames is {self.frames}, but take {take.name} has {total} frames"
+                f"learn.frames is {count}{why}, but take {take.name} has {total} frames"
                 f"{'' if self.duration is None else f' in {self.duration:g} s'}; lower it or raise learn.duration"
             )
-        stride, rest = divmod(total - 1, self.frames - 1)
+        self.prior.require_frames(self.frames_per_step or count)
+        stride, rest = divmod(total - 1, count - 1)
         if rest < stride:
-            return torch.arange(self.frames) * stride
-        return torch.linspace(0, total - 1, self.frames, dtype=torch.float64).round().long()
+            return torch.arange(count) * stride
+        return torch.linspace(0, total - 1, count, dtype=torch.float64).round().long()
 
     def field(self, start: Estimate, *, speed: float) -> GlobalField:
         """What theta means; `speed` [m/s] is the unit of an initial velocity. Raises ValueError as GlobalField does."""
@@ -222,7 +279,7 @@ class Learn:
         return search(chain, field, directions, offsets, seed=self.seed, log=log)
 
     def intervals(
-        self, field: GlobalField, theta: Tensor, seen: Shown, section: Section | None, log: Log
+        self, field: AbstractField, theta: Tensor, seen: Shown, section: Section | None, log: Log
     ) -> dict[str, Interval]:
         """Of every learned number. `section`: the thinnest beside what is held, by which the grid may be coarser than
         is usual."""
@@ -232,29 +289,38 @@ class Learn:
         unit = field.velocity_scale or 1.0
         speed = [float(v) / unit for v in field.velocity(theta)] if field.velocity_scale else []
         stiff = np.array([float(is_stiff(name)) for name in field.names])
-        fast = np.array([0.0] * len(field.groups) + speed)
+        nodes = [0.0] * (len(field.names) - len(field.groups) - len(speed))
+        fast = np.array([0.0] * len(field.groups) + speed + nodes)
         after = posterior(
             theta.detach().numpy(),
             seen.evidence,
-            before=np.array([self.guess_widths.get(n.split("+")[0], self.guess_width) for n in field.names]),
+            before=np.array([self.width(n.split("+")[0]) for n in field.names]),
             beyond=beyond.covariance(stiff, fast, seen.push),
             log=log,
         )
         return intervals(field, after)
 
-    def report(self, capture: Capture, field: GlobalField, learned: Estimate, seen: Shown, log: Log) -> None:
-        """One line per number: from, to, truth, how visible it is and between what it lies."""
+    def width(self, name: str) -> float:
+        """Of what is thought of a component of theta before the clip."""
+        return WIDTH if is_node(name) else self.guess_widths.get(name, self.guess_width)
+
+    def report(self, capture: Capture, field: AbstractField, learned: Estimate, seen: Shown | None, log: Log) -> None:
+        """One line per number: from, to, truth, how visible it is and between what it lies, as far as that is known."""
         before = physical(field, field.zero())
         after = {name: float(value.mean()) for name, value in learned.parameters.items()}
         after |= dict(zip(AXES, learned.velocity.tolist()))
-        for name, rms in zip(field.names, seen.rms):
-            log.metric(f"sensitivity/{name}", 255 * float(rms))
+        for i, name in enumerate(n for n in field.names if not is_node(n)):  # nodes are the last ones
+            visible = ""
+            if seen is not None:
+                log.metric(f"sensitivity/{name}", 255 * float(seen.rms[i]))
+                visible = f"; a factor e changes the picture by {255 * float(seen.rms[i]):.2g} of 255"
             for part in name.split("+"):
                 truth = f", truth {capture.truth[part]:.4g}" if part in capture.truth else ""
-                log.info(
-                    f"{part}: {before[part]:.4g} -> {after[part]:.4g}{truth}; a factor e changes the picture by "
-                    f"{255 * float(rms):.2g} of 255"
-                )
+                log.info(f"{part}: {before[part]:.4g} -> {after[part]:.4g}{truth}{visible}")
+        if seen is None:
+            log.info(
+                "no intervals: what a video model holds probable is no recording, and how far it is wrong nobody knows"
+            )
         self.tell(learned.intervals, log)
 
     def tell(self, told: dict[str, Interval], log: Log) -> None:

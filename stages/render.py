@@ -143,6 +143,4 @@ class Render:
         if take is not None:
             picks = take.held_out_cameras or range(len(take.cameras))
             return {f"camera{i}": take.cameras[i].scaled(self.scale) for i in picks}
-        self.fits(capture.outline)
-        view = capture.names.index(self.view) if isinstance(self.view, str) else self.view or 0
-        return {"view": capture.cameras[view].scaled(self.scale)}
+        return {"view": capture.seen_from(self.view, key="render.view").scaled(self.scale)}

@@ -1,22 +1,18 @@
 """Particles and their material -> trajectory."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Annotated, TypeGuard
+from dataclasses import dataclass
 
 import torch
 
 from physics3d.boundaries.base import AbstractBoundary
-from physics3d.boundaries.impulse import Impulse
-from physics3d.checks import Device, Frames, Keys, Rate, require_fields
+from physics3d.boundaries.impulse import Force, excited, has_force
+from physics3d.checks import Device, Frames, Rate, require_fields
 from physics3d.filling.body import Body
 from physics3d.filling.in_world import look_ahead
 from physics3d.log import Log
 from physics3d.solver import motion_of
 from physics3d.trajectory import Trajectory
 from physics3d.world import Estimate, World
-
-Force = Annotated[Mapping[str, float], Keys(("x", "y", "z"))]  # [N]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +29,7 @@ class Simulate:
     def check(self) -> None:
         """Raise ValueError naming field, value and remedy."""
         require_fields(self, "simulate")
-        if self.force is not None and any(self.force.values()) and not any(map(_has_force, self.excitation)):
+        if self.force is not None and any(self.force.values()) and not any(map(has_force, self.excitation)):
             raise ValueError(
                 f"simulate.force is {dict(self.force)}, but no impulse in simulate.excitation has a force that it "
                 "could replace; take None and say there what pushes"
@@ -75,21 +71,6 @@ class Simulate:
         _report(trajectory, log)
         log.image("motion", _plot(trajectory))
         return trajectory
-
-
-def excited(
-    excitation: tuple[AbstractBoundary, ...], force: Mapping[str, float] | None
-) -> tuple[AbstractBoundary, ...]:
-    """The excitation with `force` [N] in place of that of every impulse, and without impulses of no force."""
-    if force is None:
-        return tuple(excitation)
-    vector = (float(force["x"]), float(force["y"]), float(force["z"]))
-    pushed = tuple(replace(b, force=vector) if _has_force(b) else b for b in excitation)
-    return tuple(b for b in pushed if any(vector) or not _has_force(b))
-
-
-def _has_force(boundary: AbstractBoundary) -> TypeGuard[Impulse]:
-    return isinstance(boundary, Impulse) and boundary.force is not None
 
 
 def _on_cpu(trajectory: Trajectory) -> Trajectory:

@@ -13,6 +13,7 @@ from physics3d.learning.fields import GlobalField
 from physics3d.learning.loss import Chain
 from physics3d.log import Log
 from physics3d.materials.viscoelastic import Viscoelastic
+from physics3d.priors.estimators.sds import ScoreDistillation
 from physics3d.priors.exemplar import Exemplar
 from physics3d.scenes.base import Capture, Take
 from physics3d.world import World
@@ -86,6 +87,7 @@ def bar_chain(world: World, field: GlobalField, clip: Capture, frames: int) -> C
     return chain_of(
         world,
         Exemplar(),
+        ScoreDistillation(),
         field,
         clip,
         gaussians,

@@ -14,6 +14,8 @@ BOTTOM = (
     "physics3d.video",
     "physics3d.pictures",
     "physics3d.log",
+    "physics3d.checkpoint",
+    "physics3d.journal",
     "physics3d.open3d_import",
     "physics3d.warp_types",
     "physics3d.warp_start",

@@ -26,8 +26,8 @@ class EnforcedRotation(base.AbstractBoundary):
 
     point: base.Vector  # on the axis [m]
     axis: Direction  # any length
-    radius: Length
-    half_height: Length
+    radius: Length  # of the cylinder [m]
+    half_height: Length  # of the cylinder, along the axis to both sides of the point [m]
     angular_velocity: float  # right-handed about the axis [rad/s]
     start: Time = 0.0
     duration: Duration

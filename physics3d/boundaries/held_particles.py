@@ -26,7 +26,7 @@ BESIDE = 1.3  # particles so far apart are neighbours [of the least distance fro
 class HeldParticles(base.AbstractBoundary):
     """Holds the particles that are nearest to the positions [m] at rest."""
 
-    position: Float[Tensor, "h 3"] | tuple[base.Vector, ...]
+    position: Float[Tensor, "h 3"] | tuple[base.Vector, ...]  # the nearest particle to each is held [m]
 
     def check(self) -> None:
         try:

@@ -46,7 +46,7 @@ class ImposedMotion(base.AbstractBoundary):
     upper: base.Vector
     hole_lower: base.Vector | None = None  # matter between these corners is free [m]
     hole_upper: base.Vector | None = None
-    times: Annotated[tuple[Time, ...], MinLen(2), Ascending()]  # [s]
+    times: Annotated[tuple[Time, ...], MinLen(2), Ascending()]  # of the rows of the tables [s]
     displacement: Float[Tensor, "k 3"] | tuple[base.Vector, ...]  # d [m]
     deformation: Float[Tensor, "k 3 3"] | tuple[Rows, ...] | None = None  # A [1]; None: the identity
     centre: base.Vector = (0.0, 0.0, 0.0)  # c [m]

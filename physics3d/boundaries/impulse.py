@@ -7,7 +7,9 @@ follows the material, and the momentum it gives is force * duration exactly, wha
 """
 
 import functools
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Annotated, TypeGuard
 
 import torch
 import warp as wp
@@ -15,8 +17,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from physics3d.boundaries import base
-from physics3d.checks import Corners, Count, Duration, Length, Time, exactly_one
+from physics3d.checks import Corners, Count, Duration, Keys, Length, Time, exactly_one
 from physics3d.warp_types import vector
+
+Force = Annotated[Mapping[str, float], Keys(("x", "y", "z"))]  # [N]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,10 +31,10 @@ class Impulse(base.AbstractBoundary):
     take force = P/duration."""
 
     force: base.Vector | Tensor | None = None  # in total [N]
-    acceleration_of_each: base.Vector | Tensor | None = None  # [m/s^2]
-    centre: base.Vector | None = None  # [m]
-    radius: Length | None = None  # [m]
-    nearest: Count | None = None  # particles
+    acceleration_of_each: base.Vector | Tensor | None = None  # of each particle there, whatever it weighs [m/s^2]
+    centre: base.Vector | None = None  # of the ball, or what the nearest particles are near [m]
+    radius: Length | None = None  # of the ball [m]
+    nearest: Count | None = None  # so many particles, those nearest to the centre
     lower: base.Vector | None = None  # corners of a box [m]
     upper: base.Vector | None = None
     start: Time = 0.0
@@ -86,3 +90,19 @@ def _acceleration(real: type) -> wp.Function:
         return (weight * clock[row, b]) * vec3(q[a], q[a + 1], q[a + 2])
 
     return acceleration
+
+
+def excited(
+    excitation: tuple[base.AbstractBoundary, ...], force: Mapping[str, float] | None
+) -> tuple[base.AbstractBoundary, ...]:
+    """The excitation with `force` [N] in place of that of every impulse, and without impulses of no force."""
+    if force is None:
+        return tuple(excitation)
+    vector = (float(force["x"]), float(force["y"]), float(force["z"]))
+    pushed = tuple(replace(b, force=vector) if has_force(b) else b for b in excitation)
+    return tuple(b for b in pushed if any(vector) or not has_force(b))
+
+
+def has_force(boundary: base.AbstractBoundary) -> TypeGuard[Impulse]:
+    """Whether it pushes with a total force."""
+    return isinstance(boundary, Impulse) and boundary.force is not None

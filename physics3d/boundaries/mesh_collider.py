@@ -53,7 +53,7 @@ class MeshCollider(base.AbstractBoundary):
     in the simulated region."""
 
     path: str | None = None  # .obj, .ply or .stl
-    vertices: Float[Tensor, "n 3"] | tuple[base.Vector, ...] | None = None
+    vertices: Float[Tensor, "n 3"] | tuple[base.Vector, ...] | None = None  # where there is no file
     triangles: Int[Tensor, "m 3"] | tuple[tuple[int, int, int], ...] | None = None  # rows of `vertices`
     scale: Positive = 1.0  # of the mesh's coordinates to metres
     rotation: base.Vector = (0.0, 0.0, 0.0)  # about the mesh's origin: axis times angle [rad]

@@ -35,6 +35,13 @@ class Camera:
             self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
         )
 
+    def framed(self, width: int, height: int) -> "Camera":
+        """From the same place into a picture of width x height pixels: all that this one sees, in its middle, and more
+        on two sides where the shapes differ."""
+        s = min(width / self.width, height / self.height)
+        cx, cy = s * (self.cx - self.width / 2) + width / 2, s * (self.cy - self.height / 2) + height / 2
+        return replace(self, width=width, height=height, fx=self.fx * s, fy=self.fy * s, cx=cx, cy=cy)
+
     def check(self, name: str = "camera") -> None:
         """Raise ValueError naming the field if this is not a rigid pinhole camera."""
         M = self.world_to_camera

@@ -32,3 +32,10 @@ class Exposure:
         self.square[:, i].lerp_(gradient.square(), 0.05)
         self.values[:, i] -= size * self.mean[:, i] / (self.square[:, i].sqrt() + 1e-12)
         self.values -= self.values.mean(1, keepdim=True)
+
+    def state(self) -> tuple[Tensor, Tensor, Tensor]:
+        """All that a checkpoint has to keep of it."""
+        return self.values, self.mean, self.square
+
+    def restore(self, state: tuple[Tensor, Tensor, Tensor]) -> None:
+        self.values, self.mean, self.square = (part.to(self.values) for part in state)

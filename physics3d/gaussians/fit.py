@@ -2,7 +2,7 @@
 
 The loss is in `loss.py`. The count grows to a cap (`densification/` says how). The early part runs at a quarter and
 half resolution, and colour starts to depend on the viewing direction degree by degree. Photographs may differ in
-exposure (`exposure.py`).
+exposure (`exposure.py`). A fit that was stopped goes on from its checkpoint.
 """
 
 import math
@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from physics3d.checkpoint import Checkpoint
 from physics3d.gaussians.adam import Moments, Rates, stepped
 from physics3d.gaussians.densification.base import AbstractDensification
 from physics3d.gaussians.exposure import Exposure
@@ -68,7 +69,16 @@ def fit(
     best, stale, recent = -math.inf, 0, float("nan")
     looked_at = range(0, len(photographs), max(1, len(photographs) // SCORED_VIEWS))
 
-    steps = log.progress(range(iterations), "fitting Gaussians", total=iterations)
+    checkpoint, begin = Checkpoint(log), 0
+    if kept := checkpoint.load():
+        begin, queue, best, stale, recent = (kept[k] for k in ("step", "queue", "best", "stale", "recent"))
+        model = kept["model"].to(device)
+        moments = {name: (m.to(device), v.to(device)) for name, (m, v) in kept["moments"].items()}
+        generator.set_state(kept["generator"])
+        if lenses is not None:
+            lenses.restore(kept["lenses"])
+
+    steps = log.progress(range(begin, iterations), "fitting Gaussians", total=iterations, done=begin)
     for step in steps:
         if not queue:
             queue = torch.randperm(len(photographs), generator=generator).tolist()
@@ -117,6 +127,9 @@ def fit(
             if stale >= patience and done > GROWTH[1]:
                 log.info(f"training PSNR no longer improves after {step + 1} iterations")
                 break
+        state = dict(step=step + 1, queue=queue, best=best, stale=stale, recent=recent, model=model, moments=moments)
+        state |= dict(generator=generator.get_state(), lenses=lenses and lenses.state())
+        checkpoint.save(state, f"at step {step + 1} of {iterations}")
     steps.close()
     return model
 

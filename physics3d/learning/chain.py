@@ -11,10 +11,12 @@ from physics3d.boundaries.impulse import Impulse
 from physics3d.filling.body import Body
 from physics3d.gaussians.deform import Backdrop, render_deformed
 from physics3d.gaussians.model import Gaussians
-from physics3d.learning.fields import GlobalField
+from physics3d.journal import Journal
+from physics3d.learning.fields import AbstractField
 from physics3d.learning.loss import Chain
 from physics3d.log import Log
 from physics3d.priors.base import AbstractPrior
+from physics3d.priors.estimators.base import AbstractEstimator
 from physics3d.scenes.base import Capture, Take
 from physics3d.solver import motion_of
 from physics3d.world import World
@@ -23,7 +25,8 @@ from physics3d.world import World
 def chain_of(
     world: World,
     prior: AbstractPrior,
-    field: GlobalField,
+    estimator: AbstractEstimator,
+    field: AbstractField,
     capture: Capture,
     gaussians: Gaussians,
     body: Body,
@@ -96,7 +99,15 @@ def chain_of(
 
     known = (*world.boundaries, *(take.excitation or ()))
     forced = _stronger(known, 1.0) != known
-    return Chain(simulate=simulate, render=render, clips=clips, prior=prior, pushed=pushed if forced else None)
+    return Chain(
+        simulate=simulate,
+        render=render,
+        clips=clips,
+        prior=prior,
+        estimator=estimator,
+        pushed=pushed if forced else None,
+        journal=Journal(log),
+    )
 
 
 def _stronger(boundaries: tuple[AbstractBoundary, ...], more: float) -> tuple[AbstractBoundary, ...]:

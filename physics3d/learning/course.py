@@ -11,7 +11,7 @@ from typing import Literal
 from jaxtyping import Float
 from torch import Tensor
 
-from physics3d.learning.fields import GlobalField, physical
+from physics3d.learning.fields import AbstractField, physical
 
 WAYS = ("search", "descent", "polish")
 
@@ -25,7 +25,7 @@ class Point:
     loss: float
 
 
-def history(field: GlobalField, course: Sequence[Point]) -> dict[str, list[float]]:
+def history(field: AbstractField, course: Sequence[Point]) -> dict[str, list[float]]:
     """Physical values [SI] by name, `loss`, and `way`, the number of the way in WAYS; one number per point."""
     if not course:
         return {}

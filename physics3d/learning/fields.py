@@ -12,6 +12,7 @@ component of theta.
 
 import math
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import torch
 from jaxtyping import Float
@@ -20,6 +21,34 @@ from torch import Tensor
 from physics3d.materials.parameters import check_old_names
 
 AXES = ("velocity_x", "velocity_y", "velocity_z")
+
+
+class AbstractField(Protocol):
+    """What theta means: one number per parameter (GlobalField), or more (`stiffness_field.py`)."""
+
+    @property
+    def groups(self) -> tuple[tuple[str, ...], ...]:
+        """The parameters behind each of the first components of theta."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """One name per component of theta."""
+
+    @property
+    def velocity_scale(self) -> float | None:
+        """Unit of the initial velocity [m/s]; None: it is not learned."""
+
+    def zero(self) -> Float[Tensor, " k"]:
+        """theta at the start."""
+
+    def bound(self, theta: Float[Tensor, " k"]) -> Float[Tensor, " k"]:
+        """The nearest theta that may be."""
+
+    def parameters(self, theta: Float[Tensor, " k"]) -> dict[str, Tensor]:
+        """All physical parameters, scalars or one number per particle [p], differentiable in theta."""
+
+    def velocity(self, theta: Float[Tensor, " k"]) -> Float[Tensor, " 3"]:
+        """Initial velocity [m/s], differentiable in theta."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,7 +137,7 @@ def poissons_ratio(start: Tensor, offset: Tensor) -> Tensor:
     return (3 * ratio - 2) / (2 * (3 * ratio + 1))
 
 
-def physical(field: GlobalField, theta: Tensor) -> dict[str, float]:
+def physical(field: AbstractField, theta: Tensor) -> dict[str, float]:
     """The learned parameters in SI units."""
     values = field.parameters(theta)
     learned = {name: float(values[name].mean()) for group in field.groups for name in group}

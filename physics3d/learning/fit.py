@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from physics3d.learning.course import Point
-from physics3d.learning.fields import GlobalField, physical
+from physics3d.learning.fields import AbstractField, physical
 from physics3d.learning.loss import Chain
 from physics3d.log import Log
 
@@ -22,7 +22,7 @@ MOST_RETREATS = 3  # steps in a row with a gradient that is not finite, before g
 
 def fit(
     chain: Chain,
-    field: GlobalField,
+    field: AbstractField,
     theta: Float[Tensor, " k"],
     *,
     steps: int,
@@ -36,8 +36,9 @@ def fit(
 ) -> tuple[Float[Tensor, " k"], list[Point]]:
     """Descend from theta. Returns theta and where it was at every step, and at the end.
 
-    What is returned is the mean of the last quarter of the iterates, or the iterate of lowest loss if that is better
-    over all views and frames. Raises ValueError when the gradient stays not finite.
+    What is returned is the mean of the last quarter of the iterates; or, where losses of single steps can be compared,
+    the iterate of lowest loss, if that is better over all views and frames. Raises ValueError when the gradient stays
+    not finite.
     """
     generator = torch.Generator().manual_seed(seed)
     unit = max(chain.measure(field.zero(), seed), 1e-12)
@@ -50,12 +51,11 @@ def fit(
             some_of(list(chain.clips), views_per_step, generator),
             some_frames(chain, frames_per_step, generator),
         )
-        adam.zero_grad()
-        data = chain.loss(theta, views, frames, generator) / unit
-        (data + 0.5 * stay * theta.square().sum()).backward()
-        if not torch.isfinite(theta.grad).all():  # type: ignore[arg-type]
+        loss, slope = chain.slope(theta, views, frames, generator)
+        theta.grad = slope / unit + stay * theta.detach()
+        if not torch.isfinite(theta.grad).all():
             retreats += 1
-            log.warn(f"step {step}: gradient {theta.grad.tolist()} is not finite; going half the way back")  # type: ignore[union-attr]
+            log.warn(f"step {step}: gradient {theta.grad.tolist()} is not finite; going half the way back")
             if retreats > MOST_RETREATS:
                 raise ValueError(
                     f"learning: the gradient was not finite {retreats} times in a row (step {step}); lower "
@@ -66,28 +66,31 @@ def fit(
             continue
         retreats, good = 0, theta.detach().clone()
         norm = float(torch.nn.utils.clip_grad_norm_(theta, largest_gradient))
-        course.append(Point(way="descent", theta=good, loss=float(data.detach()) * unit))
+        course.append(Point(way="descent", theta=good, loss=loss))
         for name, value in physical(field, good).items():
             log.metric(f"parameter/{name}", value, step)
-        log.metric("loss", float(data.detach()) * unit, step)
+        log.metric("loss", loss, step)
         log.metric("gradient_norm", norm, step)
         bar.set_postfix(
-            loss=f"{float(data.detach()):.4f}", **{n.split("+")[0][:8]: f"{v:+.2f}" for n, v in zip(field.names, good)}
+            loss=f"{loss / unit:.4f}", **{n.split("+")[0][:8]: f"{v:+.2f}" for n, v in zip(field.names, good)}
         )
         adam.param_groups[0]["lr"] = learning_rate * (0.55 + 0.45 * math.cos(math.pi * step / steps))
         adam.step()
         with torch.no_grad():
             theta.copy_(field.bound(theta))
     mean = torch.stack([point.theta for point in course[-max(1, len(course) // 4) :]]).mean(0)
-    best = min(course, key=lambda point: point.loss).theta
-    losses = [chain.measure(candidate, seed) for candidate in (mean, best)]
+    found = {"mean of last quarter": mean}
+    if chain.comparable:
+        found["best iterate"] = min(course, key=lambda point: point.loss).theta
+    candidates = log.progress(found.items(), "comparing what was found", total=len(found))
+    losses = {name: chain.measure(candidate, seed) for name, candidate in candidates}
     log.info(
-        f"loss over all frames: start {unit:.5g}, mean of last quarter {losses[0]:.5g}, best iterate {losses[1]:.5g}"
+        f"loss over all frames: start {unit:.5g}, {', '.join(f'{name} {loss:.5g}' for name, loss in losses.items())}"
     )
     log.metric("loss_start", unit)
-    log.metric("loss_learned", min(losses))
-    theta = mean if losses[0] <= losses[1] else best
-    return theta, [*course, Point(way="descent", theta=theta, loss=min(losses))]
+    log.metric("loss_learned", min(losses.values()))
+    theta = found[min(losses, key=lambda name: losses[name])]
+    return theta, [*course, Point(way="descent", theta=theta, loss=min(losses.values()))]
 
 
 def some_of(items: list[int], count: int, generator: torch.Generator) -> list[int]:

@@ -27,6 +27,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import optimize
 
+from physics3d.journal import Journal
 from physics3d.learning.seen_modes import Observed
 from physics3d.log import Log
 from physics3d.modes import vibration
@@ -37,6 +38,7 @@ FAINT = 0.01  # cost of a motion in space that is not seen, in that of one that 
 WIDTH = {"zone": 0.7, "ratio": 2.0, "time": 3.0}  # of what is thought likely beforehand, in the logarithm
 LIKELY = {"ratio": 0.3, "time": 0.1}  # r, and tau [s]
 PRIOR = 1e-3  # of the motion: what one such width costs
+FIRST, FINER = 250, 1200  # materials that are tried, from each guess, and once with zones
 ASKED = 0.9  # of the unexplained motion: zones have to leave less
 
 
@@ -228,11 +230,15 @@ def fit(
     at = None if reference is None else (reference - release) / clip.fps
     moved = float(window.square.sum())
 
+    journal = Journal(log)
+
     def cost(theta: np.ndarray) -> float:
         material = Material.of(theta)
         if not np.all(np.abs(theta) < 40):
             return 1e3
-        return start(body, material, window, reference=at)[1] / moved + PRIOR * material.improbability()
+        misfit = lambda: float(start(body, material, window, reference=at)[1]) / moved
+        tried.update()
+        return journal.ask("misfit", theta.tolist(), answer=misfit) + PRIOR * material.improbability()
 
     nothing = np.zeros(zones)
     square, shape = modal(body, Material(stiffness=0.0, zones=nothing, ratio=0.0, time=0.0))
@@ -240,17 +246,18 @@ def fit(
     # what is held nowhere drifts in six modes; a leaf may swing slowly, but it is not most of what is seen
     likely = np.argsort(np.where(square > 1e-9 * square.max(), -alone, 0.0), kind="stable")[:GUESSES]
     swings = np.sqrt(square[likely]) / (2 * np.pi)
+    tried = log.progress(None, "trying materials, at most", total=FIRST * len(swings) + (FINER if zones > 1 else 0))
     best: optimize.OptimizeResult | None = None
     for guess in swings:
         first = np.array([2 * math.log(frequency / guess), math.log(LIKELY["ratio"]), math.log(LIKELY["time"])])
-        found = _descended(lambda x: cost(np.concatenate([x, nothing])), first, 250)
+        found = _descended(lambda x: cost(np.concatenate([x, nothing])), first, FIRST)
         log.info(f"largest oscillation taken for a mode at {guess:.3g} Hz: {100 * found.fun:.1f} % left unexplained")
         if best is None or found.fun < best.fun:
             best = found
     assert best is not None
     theta = np.concatenate([best.x, nothing])
     if zones > 1:
-        finer = _descended(cost, theta, 1200)
+        finer = _descended(cost, theta, FINER)
         asked = finer.fun < ASKED * best.fun
         log.info(
             f"stiffness by zones leaves {100 * finer.fun:.1f} % unexplained, one stiffness {100 * best.fun:.1f} %: "
@@ -258,6 +265,7 @@ def fit(
         )
         if asked:
             theta = finer.x
+    tried.close()
     # told one way: zones are zero in the mean
     theta[0], theta[3:] = theta[0] + theta[3:].mean(), theta[3:] - theta[3:].mean()
     material = Material.of(theta)

@@ -30,7 +30,7 @@ from annotated_types import Ge, Le
 from jaxtyping import Float
 
 from physics3d.checks import require_fields
-from physics3d.learning.fields import AXES, GlobalField, is_poissons_ratio, physical
+from physics3d.learning.fields import AXES, AbstractField, is_poissons_ratio, physical
 from physics3d.learning.sandwich import NORMAL, Evidence, spread
 from physics3d.log import Log
 from physics3d.world import Interval
@@ -110,7 +110,7 @@ def posterior(
     return Posterior(mean=before * mean, covariance=before[:, None] * covariance * before, before=before)
 
 
-def intervals(field: GlobalField, found: Posterior) -> dict[str, Interval]:
+def intervals(field: AbstractField, found: Posterior) -> dict[str, Interval]:
     """Of every learned number, by its name."""
     told: dict[str, Interval] = {}
     rows = [(name, i) for i, group in enumerate(field.groups) for name in group]

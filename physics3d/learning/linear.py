@@ -1,4 +1,7 @@
-"""The chain around theta, made linear, z0(theta + d) = z0 + J d, and what its pictures say of theta (`Evidence`)."""
+"""The chain around theta, made linear, z0(theta + d) = z0 + J d, and what its pictures say of theta (`Evidence`).
+
+For priors whose estimate does not depend on the noise: z0 - x0_hat is then a residual, as of any fit of a recording.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -9,9 +12,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from physics3d.learning.fields import GlobalField
+from physics3d.learning.fields import AbstractField
 from physics3d.learning.loss import Chain
 from physics3d.learning.sandwich import Evidence, blocks, correlation_length
+from physics3d.priors.base import draws
 
 STEP = 0.05  # of theta, in differences
 
@@ -34,14 +38,19 @@ class _Seen:
     weight: float  # w
 
 
-def linearise(chain: Chain, field: GlobalField, theta: Tensor, *, seed: int, step: float = STEP) -> Linear:
+def linearise(chain: Chain, field: AbstractField, theta: Tensor, *, seed: int, step: float = STEP) -> Linear:
     """J by forward differences in theta: k + 1 simulations, none of them differentiated."""
+    made = lambda: _linearised(chain, theta, seed, step)
+    return Linear(*chain.journal.ask("linearise", theta, seed, step, answer=made))
+
+
+def _linearised(chain: Chain, theta: Tensor, seed: int, step: float) -> tuple[Tensor, Tensor]:
     k = len(theta)
     JJ, Jr = torch.zeros(k, k).double(), torch.zeros(k).double()
     pixels = sum(clip.numel() for clip in chain.clips.values())
     for seen in _around(chain, _motions(chain, theta, step), seed, step):
         JJ, Jr = JJ + seen.weight * seen.J.T @ seen.J, Jr + seen.weight * seen.J.T @ seen.r
-    return Linear(JJ / pixels, Jr / pixels)
+    return JJ / pixels, Jr / pixels
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,12 +62,18 @@ class Shown:
     rms: Float[np.ndarray, " k"]  # change of the code per unit of theta, colour in 0..1
 
 
-def shown(chain: Chain, field: GlobalField, theta: Tensor, *, seed: int, step: float = STEP) -> Shown:
+def shown(chain: Chain, field: AbstractField, theta: Tensor, *, seed: int, step: float = STEP) -> Shown:
     """k + 1 simulations, and one more where a known force drives the motion.
 
     Scores are counted where the pictures are: s(x) = g(x) dvideo(x)/dtheta with g the gradient of the SDS loss by the
     colours of pixel x, whatever the prior's code.
     """
+    made = lambda: _shown(chain, theta, seed, step)
+    told = chain.journal.ask("shown", theta, seed, step, answer=made)
+    return Shown(evidence=Evidence(**told["evidence"]), push=told["push"], rms=told["rms"])
+
+
+def _shown(chain: Chain, theta: Tensor, seed: int, step: float) -> dict[str, Any]:
     k = len(theta)
     motions = _motions(chain, theta, step)
     if chain.pushed is not None:
@@ -89,31 +104,29 @@ def shown(chain: Chain, field: GlobalField, theta: Tensor, *, seed: int, step: f
         scores.append(summed(s))
         shares.append(summed(I))
     push = np.linalg.pinv(JJ[:k, :k], hermitian=True) @ JJ[:k, k] if len(JJ) > k else np.zeros(k)
-    evidence = Evidence(JJ=JJ[:k, :k], score=np.concatenate(scores, 1), share=np.concatenate(shares, 1))
-    return Shown(evidence=evidence, push=push, rms=np.sqrt(squares[:k] / max(count, 1)))
+    evidence = dict(JJ=JJ[:k, :k].copy(), score=np.concatenate(scores, 1), share=np.concatenate(shares, 1))
+    return dict(evidence=evidence, push=push, rms=np.sqrt(squares[:k] / max(count, 1)))
 
 
 def _motions(chain: Chain, theta: Tensor, step: float) -> list[Any]:
     """At theta, and a step beside it in each component."""
+    places = (theta, *(theta + step * torch.eye(len(theta), dtype=theta.dtype)))
     with torch.no_grad():
-        return [chain.simulate(t) for t in (theta, *(theta + step * torch.eye(len(theta), dtype=theta.dtype)))]
+        return [chain.simulate(t) for t in chain.journal.log.progress(places, "looking around")]
 
 
 def _around(chain: Chain, motions: list[Any], seed: int, step: float) -> Iterator[_Seen]:
-    """Every view of them, always with the same noise."""
-    frames = torch.arange(len(next(iter(chain.clips.values()))))
-    for view, clip in chain.clips.items():
+    """Every view of them."""
+    assert chain.certain, "a diffusion model's answers are no residuals"
+    for view in chain.clips:
         with torch.no_grad():
-            videos = [chain.render(motion, view, frames) for motion in motions]
+            videos = [chain.render(motion, view, chain.frames) for motion in motions]
             codes = [chain.prior.encode(video) for video in videos]
-            generator = torch.Generator().manual_seed(seed)
-            level = chain.prior.level(generator)
-            noise = torch.randn(codes[0].shape, generator=generator).to(codes[0])
-            condition = chain.prior.condition(clip[0], (clip,))
-            estimate = chain.prior.x0_hat(level.alpha * codes[0] + level.sigma * noise, level, condition)
+            draw = draws(chain.prior, codes[0], torch.Generator().manual_seed(seed), levels=1)[0]
+            estimate = chain.prior.estimate(codes[0], draw, chain.condition(view, chain.frames))
             J = torch.stack([(code - codes[0]).flatten() / step for code in codes[1:]], 1).double().cpu()
             r = (codes[0] - estimate).flatten().double().cpu()
-        yield _Seen(videos=videos, J=J, r=r, weight=chain.prior.weight(level))
+        yield _Seen(videos=videos, J=J, r=r, weight=chain.prior.weight(draw.level))
 
 
 def _gradient(chain: Chain, seen: _Seen) -> Float[np.ndarray, "t h w 3"]:

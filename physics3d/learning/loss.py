@@ -1,21 +1,31 @@
 """The loss of learning: theta -> motion -> video -> what the prior says of it.
 
-    L(theta) = 1/N sum_views sds(video(theta)) + stay/2 L_0 |theta|^2,     L_0 = the first term at the start, N pixels
+    L(theta) = 1/N sum_views distillation(video(theta)) + stay/2 L_0 |theta|^2,     N pixels
 
 `Chain.loss` is the first term, differentiable through prior, renderer and the whole trajectory, every substep of it.
-Those who descend add the second, each in its way (`fit.py`, `polish.py`).
+Those who descend add the second, each in its way (`fit.py`, `polish.py`). `Chain.measure` is what two theta are
+compared by, the denoising loss by always the same noise (`priors/distillation.py`); L_0 is that at the start. With a
+prior whose estimate does not depend on the noise both are the same; of a diffusion model single values of `loss` tell
+nothing.
+
+All that takes long is asked of the chain's journal, so that a learning that was stopped goes on where it was.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from physics3d.journal import Journal
+from physics3d.log import Log
 from physics3d.priors.base import AbstractPrior
-from physics3d.priors.sds import sds_loss
+from physics3d.priors.distillation import denoising_loss, distillation_loss
+from physics3d.priors.estimators.base import AbstractEstimator
+from physics3d.priors.estimators.sds import ScoreDistillation
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,21 +38,65 @@ class Chain:
     ]  # trajectory, view, indices of frames -> clip in 0..1
     clips: dict[int, Float[Tensor, "t h w 3"]]  # view -> recorded clip
     prior: AbstractPrior
+    estimator: AbstractEstimator = field(default_factory=ScoreDistillation)
     # theta [k], ln of a factor on every known force -> trajectory; None: no force is known that drives the motion
     pushed: Callable[[Tensor, float], Any] | None = None
+    journal: Journal = field(default_factory=lambda: Journal(Log(None)))
+
+    @cached_property
+    def certain(self) -> bool:
+        """Whether the prior's estimate does not depend on the noise, in any view."""
+        return all(self.prior.certain(self.condition(view, self.frames)) for view in self.clips)
+
+    @property
+    def comparable(self) -> bool:
+        """Whether single values of `loss` can be compared, and their gradient is that of `measure`."""
+        return self.estimator.descends and self.certain
+
+    @property
+    def frames(self) -> Tensor:
+        """The indices of all of them."""
+        return torch.arange(len(next(iter(self.clips.values()))))
+
+    def condition(self, view: int, frames: Tensor) -> Any:
+        """What the prior is told of a view."""
+        clip = self.clips[view]
+        return self.prior.condition(clip[0], (clip[frames],))
 
     def loss(self, theta: Tensor, views: list[int], frames: Tensor, generator: torch.Generator) -> Tensor:
         """The first term of L, differentiable in theta."""
         motion, total, pixels = self.simulate(theta), 0.0, 0
         for view in views:
-            clip = self.clips[view]
-            condition = self.prior.condition(clip[0], (clip[frames],))
-            total = total + sds_loss(self.prior, self.render(motion, view, frames), condition, generator=generator)  # type: ignore[assignment]
-            pixels += clip[frames].numel()
+            video, condition = self.render(motion, view, frames), self.condition(view, frames)
+            total = total + distillation_loss(self.prior, self.estimator, video, condition, generator=generator)  # type: ignore[assignment]
+            pixels += video.numel()
         return total / pixels  # type: ignore[return-value]
 
+    def slope(
+        self, theta: Float[Tensor, " k"], views: list[int], frames: Tensor, generator: torch.Generator
+    ) -> tuple[float, Float[Tensor, " k"]]:
+        """(the first term of L, its derivative by theta)."""
+
+        def answer() -> dict[str, Any]:
+            at = theta.detach().clone().requires_grad_()
+            loss = self.loss(at, views, frames, generator)
+            loss.backward()
+            return dict(loss=float(loss.detach()), slope=at.grad, generator=generator.get_state())
+
+        told = self.journal.ask("slope", theta, views, frames, generator.get_state(), answer=answer)
+        generator.set_state(told["generator"])
+        return told["loss"], told["slope"]
+
     def measure(self, theta: Tensor, seed: int) -> float:
-        """The first term of L over all views and frames, always with the same noise."""
-        frames = torch.arange(len(next(iter(self.clips.values()))))
+        """The denoising loss over all views and frames, always with the same noise."""
+        return self.journal.ask("measure", theta, seed, answer=lambda: self._measured(theta, seed))
+
+    def _measured(self, theta: Tensor, seed: int) -> float:
+        generator, total, pixels = torch.Generator().manual_seed(seed), 0.0, 0
         with torch.no_grad():
-            return float(self.loss(theta, list(self.clips), frames, torch.Generator().manual_seed(seed)))
+            motion = self.simulate(theta)
+            for view in self.clips:
+                video, condition = self.render(motion, view, self.frames), self.condition(view, self.frames)
+                total += denoising_loss(self.prior, video, condition, generator=generator)
+                pixels += video.numel()
+        return total / pixels

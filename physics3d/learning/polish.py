@@ -5,14 +5,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from physics3d.learning.course import Point
-from physics3d.learning.fields import GlobalField
+from physics3d.learning.fields import AbstractField
 from physics3d.learning.linear import linearise
 from physics3d.learning.loss import Chain
 from physics3d.log import Log
 
 
 def polish(
-    chain: Chain, field: GlobalField, theta: Tensor, *, steps: int, stay: float, seed: int, log: Log
+    chain: Chain, field: AbstractField, theta: Tensor, *, steps: int, stay: float, seed: int, log: Log
 ) -> tuple[Float[Tensor, " k"], list[Point]]:
     """Levenberg's steps on L: what Adam leaves undone in narrow valleys where one parameter stands in for another.
 

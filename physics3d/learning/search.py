@@ -1,4 +1,9 @@
-"""A coarse search before descending: a few forward runs that choose the valley."""
+"""A coarse search before descending: forward runs that choose the valley.
+
+Offsets are tried along a line, equally far apart. Where the lowest loss is at an end, the line goes on from there by
+the same step, so that a start which is a factor 100 off is found as one that is a factor 2 off; it ends at the span of
+the field. A second valley that is nearly as deep is said: then the clip, as far as the search sees, has two answers.
+"""
 
 import math
 
@@ -9,19 +14,47 @@ from physics3d.learning.fields import GlobalField
 from physics3d.learning.loss import Chain
 from physics3d.log import Log
 
+NEARLY = 1.5  # as deep: so many times the lowest loss, as of two answers that a descent may still exchange
+
 
 def search(
     chain: Chain, field: GlobalField, directions: Tensor, offsets: list[float], *, seed: int, log: Log
 ) -> tuple[Tensor, list[Point]]:
-    """(theta of the lowest loss among offset * directions, all that were tried, and it again): a few forward runs that
-    choose the valley to descend into."""
-    course = []
-    for i, offset in enumerate(log.progress(offsets, "coarse search")):
+    """(theta of the lowest loss among offset * directions, all that were tried, and it again). `offsets` ascend, two or
+    more, equally far apart."""
+    course: list[Point] = []
+    tried: dict[float, Point] = {}
+
+    def measure(offset: float) -> None:
         theta = field.bound(offset * directions)
-        course.append(Point(way="search", theta=theta, loss=chain.measure(theta, seed)))
-        log.metric("search/factor", math.exp(offset), i)
-        log.metric("search/loss", course[-1].loss, i)
-    best = min(range(len(offsets)), key=lambda i: course[i].loss)
-    table = ", ".join(f"x{math.exp(o):.3g}: {point.loss:.4g}" for o, point in zip(offsets, course))
-    log.info(f"coarse search over the stiffness ({table}): start at x{math.exp(offsets[best]):.3g}")
-    return course[best].theta, [*course, course[best]]
+        tried[offset] = Point(way="search", theta=theta, loss=chain.measure(theta, seed))
+        course.append(tried[offset])
+        log.metric("search/factor", math.exp(offset), len(course) - 1)
+        log.metric("search/loss", course[-1].loss, len(course) - 1)
+
+    for offset in log.progress(offsets, "coarse search"):
+        measure(offset)
+    step, limit = offsets[1] - offsets[0], math.log(field.span) + 1e-9
+    best = min(tried, key=lambda offset: tried[offset].loss)
+    while (side := (best == max(tried)) - (best == min(tried))) and abs(best + side * step) <= limit:
+        log.info(f"x{math.exp(best):.3g} is the best so far and the last that was tried: going on")
+        measure(best + side * step)
+        if tried[best].loss <= tried[best + side * step].loss:
+            break
+        best += side * step
+    table = ", ".join(f"x{math.exp(offset):.3g}: {tried[offset].loss:.4g}" for offset in sorted(tried))
+    log.info(f"coarse search over the stiffness ({table}): start at x{math.exp(best):.3g}")
+    if others := [other for other in valleys(tried) if other != best]:
+        log.warn(
+            f"two valleys explain the clip: the stiffness may as well be near x{math.exp(others[0]):.3g} of the start; "
+            "record for longer, or another push"
+        )
+    return tried[best].theta, [*course, tried[best]]
+
+
+def valleys(tried: dict[float, Point]) -> list[float]:
+    """The offsets whose loss is below that of both neighbours and NEARLY as low as the lowest, the lowest first."""
+    at = sorted(tried)
+    loss = [tried[offset].loss for offset in at]
+    inner = [i for i in range(1, len(at) - 1) if loss[i - 1] > loss[i] < loss[i + 1] and loss[i] <= NEARLY * min(loss)]
+    return [at[i] for i in sorted(inner, key=lambda i: loss[i])]

@@ -31,7 +31,9 @@ from physics3d.warp_types import matrix
 class DruckerPrager(AbstractMaterial):
     """Parameters: youngs_modulus [Pa], poissons_ratio, friction_angle [rad]."""
 
-    RANGES = ELASTIC | {"friction_angle": Annotated[float, Gt(0), Lt(math.pi / 2)]}
+    RANGES = ELASTIC | {
+        "friction_angle": Annotated[float, Gt(0), Lt(math.pi / 2)],  # phi: of the slope at which a heap stays [rad]
+    }
 
     @property
     def parameters(self) -> tuple[str, ...]:

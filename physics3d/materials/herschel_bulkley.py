@@ -44,9 +44,9 @@ class HerschelBulkley(AbstractMaterial):
     flow_index n (below 1: the faster, the thinner)."""
 
     RANGES = ELASTIC | {
-        "yield_stress": Positive,
-        "consistency": Positive,
-        "flow_index": Annotated[float, Gt(0), Lt(2)],
+        "yield_stress": Positive,  # tau_y: stress in shear below which it is a solid [Pa]
+        "consistency": Positive,  # k: stress above that at a shear rate of 1/s [Pa s^n]
+        "flow_index": Annotated[float, Gt(0), Lt(2)],  # n; below 1: the faster, the thinner
     }
 
     @property

@@ -26,7 +26,11 @@ from physics3d.warp_types import matrix
 class MooneyRivlin(AbstractMaterial):
     """Elastic; parameters first_modulus C_1, second_modulus C_2 and bulk_modulus K [Pa]."""
 
-    RANGES = {"first_modulus": Positive, "second_modulus": NotNegative, "bulk_modulus": Positive}
+    RANGES = {
+        "first_modulus": Positive,  # C_1: the larger share of the stiffness; of small strains mu = 2 (C_1 + C_2) [Pa]
+        "second_modulus": NotNegative,  # C_2: what stretching all ways and pulling one way tell apart [Pa]
+        "bulk_modulus": Positive,  # K: against a change of volume [Pa]
+    }
 
     @property
     def parameters(self) -> tuple[str, ...]:

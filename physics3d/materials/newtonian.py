@@ -36,7 +36,11 @@ _LEAST_RATE = 1e-3  # g_0 [1/s]
 class Newtonian(AbstractMaterial):
     """Parameters: bulk_modulus [Pa], viscosity k [Pa s^n], power_index n."""
 
-    RANGES = {"bulk_modulus": Positive, "viscosity": NotNegative, "power_index": Annotated[float, Ge(0), Le(2)]}
+    RANGES = {
+        "bulk_modulus": Positive,  # K: against a change of volume [Pa]
+        "viscosity": NotNegative,  # eta: stress in shear at a shear rate of 1/s [Pa s^n]
+        "power_index": Annotated[float, Ge(0), Le(2)],  # n; 1: honey, below 1: the faster, the thinner
+    }
 
     @property
     def parameters(self) -> tuple[str, ...]:

@@ -9,7 +9,10 @@ from torch import Tensor
 
 from physics3d.checks import PoissonsRatio, Positive, complaint
 
-ELASTIC = {"youngs_modulus": Positive, "poissons_ratio": PoissonsRatio}
+ELASTIC = {
+    "youngs_modulus": Positive,  # E: stiffness against being drawn out, of small strains and slow motion [Pa]
+    "poissons_ratio": PoissonsRatio,  # nu: how much it thins when drawn out; 0: not at all, near 0.5: keeps its volume
+}
 Values = dict[str, Tensor]  # physical name -> scalar or one number per particle, SI
 
 _RENAMED = {"viscosity_time": "relaxation_time"}  # in names of parameters; old configurations and estimates have them

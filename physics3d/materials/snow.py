@@ -38,9 +38,9 @@ class Snow(AbstractMaterial):
     hardening xi."""
 
     RANGES = ELASTIC | {
-        "critical_compression": Annotated[float, Gt(0), Lt(1)],
-        "critical_stretch": Positive,
-        "hardening": NotNegative,
+        "critical_compression": Annotated[float, Gt(0), Lt(1)],  # theta_c: share it is squeezed by before it packs
+        "critical_stretch": Positive,  # theta_s: share it is drawn out by before it breaks
+        "hardening": NotNegative,  # xi: packed snow is stiffer by exp(xi (1 - J_P)), J_P its volume
     }
 
     @property

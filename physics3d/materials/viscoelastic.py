@@ -44,10 +44,10 @@ from physics3d.warp_types import matrix
 
 RelaxationTime = Annotated[float, Ge(1e-30), MayBeInfinite()]  # [s]
 BRANCH = {
-    "branch_shear_modulus": Positive,
-    "branch_bulk_modulus": Positive,
-    "shear_relaxation_time": RelaxationTime,
-    "bulk_relaxation_time": RelaxationTime,
+    "branch_shear_modulus": Positive,  # mu_N: what the branch adds to the stiffness in shear of fast motion [Pa]
+    "branch_bulk_modulus": Positive,  # K_N: and to that against a change of volume [Pa]
+    "shear_relaxation_time": RelaxationTime,  # 1/k_d: after which its stress in shear has fallen to 37 % [s]
+    "bulk_relaxation_time": RelaxationTime,  # 1/k_v: and that of its pressure; inf: never [s]
 }
 
 

@@ -28,7 +28,10 @@ from physics3d.warp_types import matrix
 class VonMises(AbstractMaterial):
     """Parameters: youngs_modulus [Pa], poissons_ratio, yield_stress [Pa] in tension, hardening_modulus [Pa]."""
 
-    RANGES = ELASTIC | {"yield_stress": Positive, "hardening_modulus": NotNegative}
+    RANGES = ELASTIC | {
+        "yield_stress": Positive,  # sigma_y: stress in tension below which it comes back to its shape [Pa]
+        "hardening_modulus": NotNegative,  # h: how that grows with plastic strain; 0: not [Pa]
+    }
 
     @property
     def parameters(self) -> tuple[str, ...]:

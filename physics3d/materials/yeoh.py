@@ -30,10 +30,10 @@ class Yeoh(AbstractMaterial):
     """Elastic; parameters linear_modulus C_1, quadratic_coefficient C_2, cubic_modulus C_3 and bulk_modulus K [Pa]."""
 
     RANGES = {
-        "linear_modulus": Positive,
-        "quadratic_coefficient": Annotated[float, Ge(-LARGEST)],
-        "cubic_modulus": NotNegative,
-        "bulk_modulus": Positive,
+        "linear_modulus": Positive,  # C_1: half of mu of small strains [Pa]
+        "quadratic_coefficient": Annotated[float, Ge(-LARGEST)],  # C_2: below 0, softer in between [Pa]
+        "cubic_modulus": NotNegative,  # C_3: stiffer where it is drawn out far [Pa]
+        "bulk_modulus": Positive,  # K: against a change of volume [Pa]
     }
 
     @property

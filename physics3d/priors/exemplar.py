@@ -17,7 +17,7 @@ the thing does. `blur: [0.0]` compares plain pixels.
 
 import math
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import torch
 from annotated_types import MinLen
@@ -30,6 +30,8 @@ from physics3d.priors.base import AbstractPrior, Level
 
 @dataclass(frozen=True, kw_only=True)
 class Exemplar(AbstractPrior):
+    needs_clip: ClassVar[bool] = True
+
     # standard deviations of the low-pass [px of the video given]
     blur: Annotated[tuple[NotNegative, ...], MinLen(1)] = (1.0, 4.0)
     # noise levels, drawn uniformly in the logarithm (matters with several clips)
@@ -52,9 +54,12 @@ class Exemplar(AbstractPrior):
     def encode(self, video: Float[Tensor, "t h w 3"]) -> Float[Tensor, " d"]:
         return torch.cat([lowpass(video, blur).flatten() for blur in self.blur])
 
-    def level(self, generator: torch.Generator) -> Level:
+    def level(self, share: float) -> Level:
         low, high = (math.log(s) for s in self.sigma)
-        return Level(alpha=1.0, sigma=math.exp(low + (high - low) * float(torch.rand((), generator=generator))))
+        return Level(alpha=1.0, sigma=math.exp(low + (high - low) * share))
+
+    def certain(self, condition: Float[Tensor, "m d"]) -> bool:
+        return len(condition) == 1
 
     def x0_hat(self, z_t: Tensor, level: Level, condition: Float[Tensor, "m d"]) -> Float[Tensor, " d"]:
         if condition.shape[1:] != z_t.shape:

@@ -38,7 +38,7 @@ RADIUS = 0.05  # [m]
 @dataclass(frozen=True, kw_only=True)
 class BallTwin(AbstractSource):
     # what is photographed
-    views: Count = 16
+    views: Count = 16  # photographs, from all around
     width: Pixels = 96  # [px]
     height: Pixels = 96  # [px]
     held_out_every: Every = 8

@@ -121,6 +121,16 @@ class Capture(AbstractArtifact):
         takes = tuple(take.footage for take in self.takes)
         return Outline(name=self.name, names=self.names, mattes=bool(self.alphas), takes=takes)
 
+    def seen_from(self, view: int | str | None, *, key: str) -> Camera:
+        """The camera of a photograph by index or name; of the first one if `view` is None. Raises ValueError, naming
+        `key`, if there is no such photograph."""
+        if isinstance(view, str) and view not in self.names:
+            raise ValueError(f"{key} is {view!r}; the photographs are {', '.join(self.names[:8])}, ...")
+        number = self.names.index(view) if isinstance(view, str) else view or 0
+        if number >= len(self.cameras):
+            raise ValueError(f"{key} is {view}; the capture has views 0 to {len(self.cameras) - 1}")
+        return self.cameras[number]
+
     def take(self, role: str) -> Take | None:
         """The first take of that role, or None."""
         return next((t for t in self.takes if t.role == role), None)

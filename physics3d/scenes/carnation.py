@@ -41,7 +41,7 @@ from physics3d.world import World
 @dataclass(frozen=True, kw_only=True)
 class CarnationTwin(AbstractSource):
     # what is photographed
-    views: Count = 40
+    views: Count = 40  # photographs, from all around
     width: Pixels = 320  # [px]
     height: Pixels = 240  # [px]
     held_out_every: Every = 8  # every so many photographs are kept for evaluation

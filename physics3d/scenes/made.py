@@ -11,6 +11,7 @@ than the pipeline takes, and the pictures are ray traced from meshes: learning h
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32
@@ -40,8 +41,8 @@ from physics3d.world import World
 @dataclass(frozen=True, kw_only=True)
 class MadeTwin(AbstractSource):
     name: Text
-    moving: Mapping[str, AbstractShape]
-    still: Mapping[str, AbstractShape] = field(default_factory=dict)
+    moving: Mapping[str, AbstractShape]  # what sways, shape by shape, under names of one's own
+    still: Mapping[str, AbstractShape] = field(default_factory=dict)  # what stands around it
     world: World  # the truth
     learn: tuple[AbstractBoundary, ...]  # what sets it going in the take to learn from
     evaluate: tuple[AbstractBoundary, ...]  # in the take that is held out
@@ -76,7 +77,7 @@ class MadeTwin(AbstractSource):
 
     def __call__(self, *, log) -> Capture:
         self.check()
-        seen = dict(target=self.target, distance=self.distance, opening=self.opening)
+        seen: Any = dict(target=self.target, distance=self.distance, opening=self.opening)
         return captured(
             name=self.name,
             world=self.world,

@@ -30,7 +30,7 @@ ROWS = 72  # vertices along it, at least
 class AbstractShape(abc.ABC):
     """A closed surface, and how it is coloured. Colours are sRGB."""
 
-    colour: Colour
+    colour: Colour  # red, green, blue, 0..1
     second: Colour = (1.0, 1.0, 1.0)  # of bands and veins
     bands: tuple[tuple[Share, Share], ...] = ()  # from, to: shares of the length that have the second colour
     mottle: Share = 0.1  # how uneven the colour is
@@ -72,10 +72,10 @@ class AbstractShape(abc.ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class Ball(AbstractShape):
-    centre: Place
+    centre: Place  # its middle [m]
     half: tuple[Length, Length, Length]  # half axes a, b, c [m]
     power: Annotated[float, Ge(1), Le(40)] = 2.0  # p
-    turn: Turn = (0.0, 0.0, 0.0)
+    turn: Turn = (0.0, 0.0, 0.0)  # about x, then y, then z [deg]
 
     def surface(self) -> Float[np.ndarray, "a b 3"]:
         polar, angle = np.meshgrid(
@@ -127,7 +127,7 @@ class Turned(AbstractShape):
     curls: Annotated[int, Ge(0), Le(100)] = 0  # n around the rim
     curl_height: float = 0.0  # h at the rim; it grows with the square of r from the axis, or the inner edge [m]
     foot: Place = (0.0, 0.0, 0.0)  # where the profile's (0, 0) stands [m]
-    turn: Turn = (0.0, 0.0, 0.0)
+    turn: Turn = (0.0, 0.0, 0.0)  # about x, then y, then z [deg]
 
     def check(self) -> None:
         super().check()
@@ -156,7 +156,7 @@ class Sheet(AbstractShape):
     path: Annotated[tuple[Place, ...], MinLen(2)]  # of its middle [m]
     across: Direction  # along its width, about square to the path
     half_widths: Annotated[tuple[NotNegative, ...], MinLen(1)]  # at these points; one: everywhere [m]
-    thickness: Length  # [m]
+    thickness: Length  # from face to face [m]
     fold: float = 0.0  # how far its edges are lifted, over their distance from the middle
     lobes: NotNegative = 0.0  # how far the edges reach back behind the first point, as those of a heart do [m]
     waves: NotNegative = 0.0  # of its edges [m]

@@ -7,6 +7,7 @@ Solids are sampled with particles of their own, and vertices follow the particle
 which is exact for affine motion.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -39,7 +40,7 @@ def captured(
     *,
     name: str,
     world: World,
-    pokes: dict[str, tuple[AbstractBoundary, ...]],
+    pokes: Mapping[str, tuple[AbstractBoundary, ...]],
     matter: tuple[Float32[np.ndarray, "p 3"], Float32[np.ndarray, " p"]],
     studio: Studio,
     cameras: list[Camera],

@@ -140,6 +140,47 @@ def test_stay_holds_an_uncertain_parameter_near_its_start():
     assert abs(float(held[0])) < 0.5 * abs(float(free[0]))
 
 
+def seen_as(brightness, start: float, span: float = 1e4) -> tuple[Chain, GlobalField]:
+    """A chain whose picture is as bright as `brightness` of ln E, recorded at E = 1, with stripes that nothing
+    explains."""
+    field = GlobalField(start={"youngs_modulus": torch.tensor(start)}, learn=("youngs_modulus",), span=span)
+    simulate = lambda theta: field.parameters(theta)["youngs_modulus"].log()
+    render = lambda motion, view, frames: (0.5 + brightness(motion)).expand(len(frames), 3, 4, 3)
+    stripes = 0.01 * torch.tensor([1.0, -1.0, 1.0, -1.0])[:, None]
+    clip = render(torch.tensor(0.0).double(), 0, torch.arange(2)) + stripes
+    return Chain(simulate=simulate, render=render, clips={0: clip}, prior=Exemplar(blur=(0.0,))), field
+
+
+@pytest.mark.parametrize("start", [0.01, 0.1, 1.0, 10.0, 100.0])
+def test_the_search_finds_the_valley_from_starts_over_four_decades(start):
+    """The nearest of x2 steps to E = 1, whichever way, without trying the whole span."""
+    chain, field = seen_as(lambda lnE: 0.02 * lnE, start)
+    offsets = (math.log(2) * torch.arange(-2, 3)).tolist()
+    theta, course = search(chain, field, torch.ones(1).double(), offsets, seed=0, log=Log(None))
+    found = start * math.exp(float(theta))
+    assert abs(math.log(found)) <= 0.5 * math.log(2) + 1e-6
+    needed = max(0, round(abs(math.log2(start))) - 2)
+    assert len(course) - 1 <= len(offsets) + needed + 1
+
+
+def test_the_search_ends_at_the_span(tmp_path):
+    chain, field = seen_as(lambda lnE: 0.02 * lnE, 100.0, span=10.0)
+    offsets = (math.log(2) * torch.arange(-2, 3)).tolist()
+    theta, _ = search(chain, field, torch.ones(1).double(), offsets, seed=0, log=Log(tmp_path, quiet=True))
+    assert float(theta) == pytest.approx(-3 * math.log(2))
+    assert "going on" in (tmp_path / "log.txt").read_text()
+
+
+def test_two_valleys_are_said(tmp_path):
+    """Pictures that come back when E is 16 times as large; one valley, seen just as finely, is not two."""
+    offsets = (math.log(2) * torch.arange(-3, 7)).tolist()
+    for name, brightness in (("two", lambda lnE: 0.2 * torch.sin(math.pi * lnE / math.log(16))), ("one", torch.tanh)):
+        chain, field = seen_as(brightness, 1.0)
+        search(chain, field, torch.ones(1).double(), offsets, seed=0, log=Log(tmp_path / name, quiet=True))
+        told = (tmp_path / name / "log.txt").read_text()
+        assert ("two valleys explain the clip: the stiffness may as well be near x16" in told) == (name == "two")
+
+
 def test_search_steps_over_a_period_that_descent_cannot():
     """From 1/6 of the true frequency the pictures are out of phase, and descent alone ends elsewhere."""
     chain, field = toy()

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 from toy import ALL, configuration
 
-from pipeline.flow import first, plan, suit
+from pipeline.flow import first, left_out, plan, suit
 from pipeline.page import STAGES
-from pipeline.settings import compose
+from pipeline.settings import choices, compose
 from pipeline.stage import StageError, build, run
 from pipeline.tracking import EXPERIMENT, address, flatten
 
@@ -89,6 +89,33 @@ def test_a_stage_that_cannot_take_the_scene_is_refused_before_the_scene_is_made(
     with pytest.raises(StageError, match=message):
         suit(stages, stages["capture"].source.outline, {})
     suit(stages, stages["capture"].source.outline, {"learn": "left out", "segment": "left out"})
+
+
+@pytest.mark.parametrize("prior", choices("prior"))
+def test_learning_without_a_recording_is_left_out_only_for_priors_that_need_one(tmp_path, prior):
+    """Python's own answer is the truth; the graph reads it off the source."""
+    config, _ = compose(["scene=plush", f"prior={prior}"])
+    bare = {"takes": [], "gaussians": None, "single_object": False, "images": True}
+    module, _, name = config["prior"]["_target_"].rpartition(".")
+    needs = getattr(__import__(module, fromlist=[name]), name).needs_clip
+    assert ("learn" in left_out(config, bare, tmp_path)) == needs == (prior == "exemplar")
+    assert "evaluate" in left_out(config, bare, tmp_path)
+
+
+def test_what_would_be_imagined_changes_nothing_where_a_motion_was_recorded(tmp_path):
+    """Another poke to simulate is no other recording to learn from; without one it is."""
+    (tmp_path / "weights").mkdir()
+    prior = {"_target_": "physics3d.priors.modelscope.ModelScope", "prompt": "x", "model": str(tmp_path / "weights")}
+    for roles, same in ((["learn", "evaluate"], True), ([], False)):
+        keys = []
+        for force in (1.0, 2.0):
+            imagined = {"_target_": "toy.Material", "modulus": force}
+            learn = {"imagined": imagined, "prior": prior}
+            config = configuration(tmp_path, capture={"roles": roles}, learn=learn)
+            capture = first(config, tmp_path / "artifacts")
+            run(capture, "cpu")
+            keys += [step.fingerprint for step in plan(config, capture).steps if step.name == "learn"]
+        assert len(keys) == 2 and (keys[0] == keys[1]) == same
 
 
 def test_initial_material_is_simulated_without_what_was_learned(tmp_path):

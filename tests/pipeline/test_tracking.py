@@ -10,9 +10,12 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 
+import pipeline.live
+from physics3d.log import Log
 from pipeline.stage import Filed, Step
 from pipeline.tracking import EXPERIMENT, Tracking, _process, address, free_port, mend
 
@@ -210,6 +213,43 @@ def test_parents_say_what_was_reused_how_long_it_took_and_show_it(folder):
     }
     attached = {f.path for place in ("videos", "plots/learn") for f in made.client.list_artifacts(made.run, place)}
     assert attached == {"videos/a.mp4", "plots/learn/parameters.png"}  # not what belongs to a step of the learning
+
+
+def test_curves_grow_and_previews_appear_while_a_step_is_at_work_and_none_comes_twice(folder, monkeypatch):
+    monkeypatch.setattr(pipeline.live, "EVERY", 0.05)
+    monkeypatch.setattr(pipeline.live, "STILL", 0.0)
+    step = Step("learn", "learn", {}, (), folder / "artifacts", "0" * 16)
+    made = Tracking(folder, config={}, name="x", tags={})
+    made.begin(step)
+    assert not made.broken
+    run, at_work = made.live.run, step.unfinished
+    log = Log(at_work, quiet=True)
+
+    def shown() -> list[tuple[int, float]]:
+        return [(point.step, point.value) for point in made.client.get_metric_history(run, "loss")]
+
+    for i in range(2):
+        log.metric("loss", 5.0 - i, i)
+        log.image("frame", np.zeros((4, 4, 3)), i)
+        while len(shown()) <= i or len(made.client.list_artifacts(run, "images")) <= i:
+            assert made.live.thread.is_alive()
+            time.sleep(0.02)
+    told = (at_work / "metrics.jsonl").read_text()
+    (at_work / "metrics.jsonl").unlink()  # as of a stage that goes on from its checkpoint
+    (at_work / "metrics.jsonl").write_text(told)
+    log.metric("loss", 3.0, 2)
+    at_work.rename(step.folder)
+    made.stage(Filed(step, False, {"seconds": 3.0, "peak_rss_bytes": 1}))
+    made.close(scores={}, status="FINISHED")
+    assert not made.broken and sorted(shown()) == [(0, 5.0), (1, 4.0), (2, 3.0)]
+    assert dict(rows(folder, "select name, status from runs")) == {"learn": "FINISHED", "x": "FINISHED"}
+
+
+def test_the_run_of_a_step_that_fails_ends_with_it(folder):
+    made = Tracking(folder, config={}, name="x", tags={})
+    made.begin(Step("learn", "learn", {}, (), folder / "artifacts", "0" * 16))
+    made.close(scores={}, status="FAILED")
+    assert dict(rows(folder, "select name, status from runs")) == {"learn": "FAILED", "x": "FAILED"}
 
 
 def test_the_experiment_says_that_it_is_of_training_runs(folder):

@@ -1,12 +1,14 @@
 """Throw-away stages to test the machinery with; switches make them slow, fail, or fill the disk."""
 
 import os
+import signal
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
 
+from physics3d.checkpoint import Checkpoint
 from physics3d.gaussians.cameras import Camera
 from physics3d.gaussians.model import Gaussians
 from physics3d.log import Log
@@ -120,6 +122,8 @@ class Material:
     error: str = ""
     diary: str = ""
     name: str = ""
+    prior: object = None
+    imagined: object = None
 
     def __call__(self, *inputs: object, log: Log) -> Estimate:
         note(self.diary, self.name)
@@ -156,3 +160,38 @@ def blob() -> Gaussians:
         opacity_logit=torch.zeros(1),
         sh=torch.zeros(1, 1, 3),
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Counting:
+    """A random walk in steps, with a checkpoint after each; a file "stop at <step>" beside the diary says how it ends
+    there: kill, or interrupt, after which the file is gone."""
+
+    steps: int
+    diary: str
+    size: int = 0  # of what a checkpoint holds beside the walk [byte]
+
+    def __call__(self, *, log: Log) -> Video:
+        log.info("counting")
+        generator, checkpoint = torch.Generator().manual_seed(0), Checkpoint(log)
+        begin, walk = 0, torch.zeros(4)
+        if kept := checkpoint.load():
+            begin, walk = kept["step"], kept["walk"]
+            generator.set_state(kept["generator"])
+        for step in range(begin, self.steps):
+            note(self.diary, str(step))
+            walk = walk + torch.rand(4, generator=generator)
+            log.metric("curve", float(walk[0]), step)
+            log.image("frame", torch.full((8, 8, 3), 0.1 * step), step)
+            state = dict(step=step + 1, walk=walk, generator=generator.get_state(), more=torch.zeros(self.size))
+            checkpoint.save(state, f"at step {step + 1} of {self.steps}")
+            order = Path(self.diary).with_name(f"stop at {step}")
+            if order.exists():
+                how = order.read_text()
+                order.unlink()
+                if how == "kill":
+                    os.kill(os.getpid(), signal.SIGKILL)
+                raise KeyboardInterrupt
+        return Video(
+            frames=((255 * walk / self.steps).byte().reshape(1, 2, 2, 1).repeat(1, 1, 1, 3),), fps=1.0, names=("toy",)
+        )

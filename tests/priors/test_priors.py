@@ -6,9 +6,10 @@ import pytest
 import torch
 
 from physics3d.priors.base import AbstractPrior, Level, x0_from
+from physics3d.priors.distillation import distillation_loss
+from physics3d.priors.estimators.sds import ScoreDistillation
 from physics3d.priors.exemplar import Exemplar
 from physics3d.priors.modelscope import ModelScope
-from physics3d.priors.sds import sds_loss
 from physics3d.priors.stable_video import StableVideo
 
 LEVELS = {  # (alpha, sigma) that each parametrisation is used with
@@ -16,6 +17,11 @@ LEVELS = {  # (alpha, sigma) that each parametrisation is used with
     "v_prediction": (0.8, 0.6),
     "v_prediction in sigma space": (1.0, 3.0),
 }
+
+
+def distilled(prior, video, condition, *, generator):
+    """The loss of plain score distillation."""
+    return distillation_loss(prior, ScoreDistillation(), video, condition, generator=generator)
 
 
 def clip(seed: int, shape=(3, 8, 10, 3), dtype=torch.float64):
@@ -49,14 +55,14 @@ def test_unknown_prediction_is_refused():
 def test_one_exemplar_gives_the_closed_form_gradient():
     prior = Exemplar(blur=(0.0,))
     x, y = clip(0).requires_grad_(), clip(1)
-    sds_loss(prior, x, prior.condition(y[0], (y,)), generator=torch.Generator().manual_seed(3)).backward()
+    distilled(prior, x, prior.condition(y[0], (y,)), generator=torch.Generator().manual_seed(3)).backward()
     torch.testing.assert_close(x.grad, x.detach() - y, rtol=0, atol=1e-14)  # w = 1, encode = identity
 
 
 def test_pyramid_gradient_is_that_of_the_filtered_difference():
     prior = Exemplar(blur=(1.0, 3.0))
     x, y = clip(0).requires_grad_(), clip(1)
-    sds_loss(prior, x, prior.condition(y[0], (y,)), generator=torch.Generator().manual_seed(3)).backward()
+    distilled(prior, x, prior.condition(y[0], (y,)), generator=torch.Generator().manual_seed(3)).backward()
     expected = torch.autograd.functional.vjp(prior.encode, x.detach(), prior.encode(x.detach() - y))[1]
     torch.testing.assert_close(x.grad, expected, rtol=0, atol=1e-12)  # A^T A (x - y) because A is linear
 
@@ -66,7 +72,7 @@ def test_gradient_vanishes_at_the_exemplar_and_only_there():
     y = clip(1)
     for x, zero in ((y.clone(), True), (y + 0.01, False)):
         x.requires_grad_()
-        sds_loss(prior, x, prior.condition(y[0], (y,)), generator=torch.Generator().manual_seed(3)).backward()
+        distilled(prior, x, prior.condition(y[0], (y,)), generator=torch.Generator().manual_seed(3)).backward()
         assert (x.grad.abs().max() == 0) == zero
 
 
@@ -100,7 +106,7 @@ def test_blur_sees_a_small_thing_move_beyond_its_width():
         dot = lambda centre: torch.exp(-0.5 * (u - centre) ** 2 / 0.6**2)[None, None, :, None].expand(2, 30, 40, 3)
         centre = torch.tensor(14.0, dtype=torch.float64, requires_grad=True)
         reference = dot(20.0)
-        sds_loss(
+        distilled(
             prior, dot(centre), prior.condition(reference[0], (reference,)), generator=torch.Generator()
         ).backward()
         return float(centre.grad)
@@ -114,7 +120,7 @@ def test_same_seed_same_gradient_other_seed_other_noise():
     y1, y2 = clip(1), clip(2)
     codes = prior.condition(y1[0], (y1, y2))
     x = 0.5 * (y1 + y2)
-    loss = [float(sds_loss(prior, x, codes, generator=torch.Generator().manual_seed(s))) for s in (0, 0, 1)]
+    loss = [float(distilled(prior, x, codes, generator=torch.Generator().manual_seed(s))) for s in (0, 0, 1)]
     assert loss[0] == loss[1] != loss[2]
 
 
@@ -140,7 +146,7 @@ def test_exemplars_and_video_of_different_size_are_refused():
     prior = Exemplar()
     codes = prior.condition(clip(0)[0], (clip(0),))
     with pytest.raises(ValueError, match="as many frames"):
-        sds_loss(prior, clip(0)[:2], codes, generator=torch.Generator())
+        distilled(prior, clip(0)[:2], codes, generator=torch.Generator())
 
 
 # --- diffusion models, tiny and random ---------------------------------------------------------------------------
@@ -165,7 +171,7 @@ def test_gradient_reaches_every_frame_of_the_pixels(models, name):
     prior: AbstractPrior = models[name]
     video = clip(5, (4, 16, 16, 3), torch.float32).requires_grad_()
     condition = prior.condition(video.detach()[0], (video.detach(),))
-    loss = sds_loss(prior, video, condition, generator=torch.Generator().manual_seed(0))
+    loss = distilled(prior, video, condition, generator=torch.Generator().manual_seed(0))
     loss.backward()
     assert torch.isfinite(video.grad).all() and (video.grad.flatten(1).norm(dim=1) > 0).all()
     assert all(p.grad is None for p in prior.pipeline.unet.parameters())
@@ -177,9 +183,9 @@ def test_gradient_is_the_score_pulled_back_through_the_encoder_alone(models, nam
     prior: AbstractPrior = models[name]
     video = clip(5, (3, 16, 16, 3), torch.float32).requires_grad_()
     condition = prior.condition(video.detach()[0], (video.detach(),))
-    sds_loss(prior, video, condition, generator=torch.Generator().manual_seed(7)).backward()
+    distilled(prior, video, condition, generator=torch.Generator().manual_seed(7)).backward()
     generator = torch.Generator().manual_seed(7)
-    level = prior.level(generator)
+    level = prior.level(float(torch.rand((), generator=generator)))
     z0 = prior.encode(video)
     with torch.no_grad():
         noise = torch.randn(z0.shape, generator=generator)
@@ -196,7 +202,7 @@ def test_a_perfect_network_gives_exactly_no_gradient(models, name, monkeypatch):
     condition = prior.condition(video.detach()[0], (video.detach(),))
     z0 = prior.encode(video).detach()
     generator = torch.Generator().manual_seed(1)
-    level = prior.level(generator)
+    level = prior.level(float(torch.rand((), generator=generator)))
     noise = torch.randn(z0.shape, generator=generator)
     kind = prior.pipeline.scheduler.config.prediction_type
     output = network_output(kind, z0, noise, level)
@@ -204,7 +210,7 @@ def test_a_perfect_network_gives_exactly_no_gradient(models, name, monkeypatch):
     monkeypatch.setattr(prior.pipeline.unet, "forward", lambda *args, **kwargs: (stacked,))
     estimate = prior.x0_hat(level.alpha * z0 + level.sigma * noise, level, condition)
     torch.testing.assert_close(estimate, z0, rtol=0, atol=2e-5)  # float32: sigma eps with sigma up to 30 cancels
-    sds_loss(prior, video, condition, generator=torch.Generator().manual_seed(1)).backward()
+    distilled(prior, video, condition, generator=torch.Generator().manual_seed(1)).backward()
     assert float(video.grad.abs().max()) < 1e-4 * float(z0.abs().max() / 0.18)
 
 

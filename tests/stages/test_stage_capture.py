@@ -2,7 +2,10 @@
 
 import json
 
+import numpy as np
+import pytest
 import torch
+from clips import FPS, decaying, encode, swinging_rod
 from PIL import Image
 
 from physics3d.gaussians.cameras import Camera, look_at
@@ -47,3 +50,49 @@ def test_previews_and_counts_of_views_and_takes_are_kept(tmp_path):
     numbers = {row["name"]: row["value"] for row in map(json.loads, (tmp_path / "metrics.jsonl").open())}
     assert numbers == {"views": 2, "views_held_out": 1, "points": 0}
     assert "hello" in (tmp_path / "log.txt").read_text()
+
+
+def test_a_picture_of_another_shape_has_the_whole_photograph_in_its_middle():
+    """What the photograph's corners see lies on two edges of the new picture, as far from its middle on either side."""
+    camera = small(32, 24)
+    corners = torch.tensor([[0.0, 0.0, 1.0], [32.0, 24.0, 1.0]], dtype=torch.float64)
+    K = torch.tensor([[20.0, 0.0, 16.0], [0.0, 20.0, 12.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    M = camera.world_to_camera.double()
+    world = ((torch.linalg.inv(K) @ corners.T) - M[:3, 3:]).T @ M[:3, :3]
+    for width, height, low, high in (
+        (64, 24, (16, 0), (48, 24)),
+        (32, 48, (0, 12), (32, 36)),
+        (64, 48, (0, 0), (64, 48)),
+    ):
+        framed = camera.framed(width, height)
+        assert (framed.width, framed.height) == (width, height)
+        seen, depth = framed.project(world)
+        # float32 extrinsics
+        torch.testing.assert_close(seen, torch.tensor([low, high], dtype=seen.dtype), rtol=0, atol=1e-4)
+        assert bool((depth > 0).all())
+
+
+def test_a_clip_made_of_the_scene_is_a_take_of_its_camera(tmp_path):
+    """In the place of the takes of the scene; nobody knows what pushed it."""
+    path = tmp_path / "made.mp4"
+    encode(swinging_rod(decaying(np.arange(90) / FPS, 2.0, 0.8, 11.0)), path)
+    image, camera = torch.zeros((24, 32, 3), dtype=torch.uint8), small(32, 24)
+    old = Take(name="old", role="learn", fps=25.0, cameras=(camera,), videos=(image.expand(5, -1, -1, -1),))
+    scene = Capture(name="scene", images=(image,) * 2, cameras=(small(16, 12), camera), names=("a", "b"), takes=(old,))
+    scene = Capture(**{**vars(scene), "images": (image[:12, :16], image)})
+    stage = LoadCapture(source=Fixed(scene), clip=str(path), view="b")
+    (take,) = stage(log=Log(None)).takes
+    assert (take.name, take.role, take.fps, take.excitation, take.at_rest) == ("made", "learn", FPS, None, True)
+    h, w = take.videos[0].shape[1:3]
+    assert (h, w) == (144, 192) and take.cameras[0] == camera.framed(w, h)
+    assert take.cameras[0].fx == pytest.approx(20 * 192 / 32)
+    assert stage.files() == (str(path),)
+
+
+def test_a_clip_that_cannot_be_learned_from_is_refused(tmp_path):
+    image = torch.zeros((24, 32, 3), dtype=torch.uint8)
+    scene = Fixed(Capture(name="scene", images=(image,), cameras=(small(32, 24),), names=("a",)))
+    encode(swinging_rod(np.zeros(60)), tmp_path / "still.mp4")
+    for clip, view, word in (("still.mp4", None, "still.mp4"), ("none.mp4", None, "no clip at")):
+        with pytest.raises(ValueError, match=word):
+            LoadCapture(source=scene, clip=str(tmp_path / clip), view=view)(log=Log(None))

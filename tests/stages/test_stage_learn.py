@@ -6,13 +6,18 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import pytest
 import torch
-from small_scene import ELASTIC, bar, capture, learner
+from gaussian_prior import GaussianPrior
+from small_scene import ELASTIC, POKE, bar, cameras, capture, learner
 
 from physics3d.filling.section import Section
 from physics3d.learning.chain import chain_of
+from physics3d.learning.imagined import Imagined
 from physics3d.learning.linear import Shown
 from physics3d.learning.sandwich import Evidence
 from physics3d.log import Log
+from physics3d.priors.estimators.sds import ScoreDistillation
+from physics3d.priors.estimators.stratified import Stratified
+from physics3d.priors.exemplar import Exemplar
 from physics3d.scenes.base import Footage
 from physics3d.world import Estimate, World
 
@@ -150,7 +155,9 @@ def test_frames_that_are_not_equally_far_apart_are_compared_with_the_same_instan
     found = {}
     for at in (stage.spread(clip.takes[0].footage), torch.arange(7)):
         how = dict(image_scale=1.0, device="cpu", log=Log(None))
-        chain = chain_of(stage.world, stage.prior, field, clip, gaussians, body, clip.takes[0], at, **how)
+        chain = chain_of(
+            stage.world, stage.prior, stage.estimator, field, clip, gaussians, body, clip.takes[0], at, **how
+        )
         drawn = chain.render(chain.simulate(field.zero()), 0, torch.arange(7))
         found[tuple(at.tolist())] = drawn
         assert float((drawn - clip.takes[0].videos[0][at].float() / 255).abs().max()) <= 0.5 / 255 + 1e-3
@@ -216,3 +223,63 @@ def test_what_cannot_be_learned_from_is_found_before_learning_begins(clip, tmp_p
     with pytest.raises(ValueError, match=r"world.dx is 2 m.* smaller than a cell"):
         replace(stage, world=replace(stage.world, dx=2.0))(clip, gaussians, body, log=log)
     assert not (tmp_path / "log.txt").exists()
+
+
+# ---- priors that need no recording
+
+
+def unrecorded(clip):
+    """The bar, photographed and never filmed."""
+    view = cameras()[0]
+    image = clip.takes[0].videos[0][0]
+    return replace(clip, images=(image,), cameras=(view,), names=("front",), takes=())
+
+
+def imagined(**change):
+    return Imagined(**({"frames": 10, "fps": 20.0, "excitation": POKE, "view": "front"} | change))
+
+
+def test_what_a_prior_holds_probable_is_learned_without_a_recording(clip, tmp_path):
+    """Videos are normal around the true one, says the prior: E is found as from a recording, by noisy gradients alone.
+    15 %: what ten steps of at most that leave."""
+    truth = clip.takes[0].videos[0].float() / 255
+    prior = GaussianPrior(mean=truth, deviation=0.05, sigma=(0.05, 1.0), frames=10)
+    estimator = Stratified(of=ScoreDistillation())
+    stage = learner(
+        START, ("youngs_modulus",), prior=prior, estimator=estimator, imagined=imagined(), frames=None, search=4,
+        search_span=8.0, steps=10, polish=2,
+    )  # fmt: skip
+    estimate = stage(unrecorded(clip), *bar(), log=Log(tmp_path, quiet=True))
+    assert float(estimate.parameters["youngs_modulus"]) == pytest.approx(2e4, rel=0.15)
+    assert estimate.intervals == {}
+    told = (tmp_path / "log.txt").read_text()
+    assert "no intervals: what a video model holds probable" in told and "no polish" in told
+
+
+def test_frames_are_those_that_the_prior_was_trained_on(clip):
+    stage = learner(START, ("youngs_modulus",), prior=GaussianPrior(mean=torch.zeros(1), frames=4), frames=None)
+    assert stage.spread(clip.takes[0].footage).tolist() == [0, 3, 6, 9]
+    with pytest.raises(
+        ValueError, match=r"learn.frames is 14 \(null: as many as the prior was trained on\), but .* 10"
+    ):
+        replace(stage, prior=GaussianPrior(mean=torch.zeros(1), frames=14)).fits(clip.outline)
+    short = replace(stage, prior=GaussianPrior(mean=torch.zeros(1), frames=14), imagined=imagined())
+    with pytest.raises(ValueError, match="take imagined has 10 frames"):
+        short.fits(unrecorded(clip).outline)
+
+
+def test_what_cannot_be_imagined_is_refused(clip):
+    """Nothing pushes; no such view; a prior that knows recordings alone."""
+    stage = learner(START, ("youngs_modulus",), prior=GaussianPrior(mean=torch.zeros(1)))
+    scene = unrecorded(clip)
+    still = imagined(force={"x": 0.0, "y": 0.0, "z": 0.0})
+    for wrong, word in (
+        (replace(stage, imagined=still), "nothing pushes the body"),
+        (replace(stage, imagined=imagined(excitation=())), "nothing pushes the body"),
+        (replace(stage, imagined=imagined(view="back")), "render.view is 'back'"),
+        (replace(stage, imagined=imagined(view=3)), "render.view is 3"),
+        (replace(stage, imagined=imagined(), prior=Exemplar()), "no take with role learn"),
+        (stage, "no take with role learn"),
+    ):
+        with pytest.raises(ValueError, match=word):
+            wrong(scene, *bar(), log=Log(None))

@@ -1,0 +1,132 @@
+"""make compare SCENES=carnation,cake [METHODS=...] [OUT=<folder>]: the table of the paper by one command.
+
+    python -m pipeline.compare scenes=... [methods=...] [out=...] [runner=thread|process|dask] [workers=1] [key=value]
+
+Every method of conf/method runs on every scene, as `make sweep` runs them: what they have in common is computed once,
+and a second call goes on where the first was stopped. Beside them stand the first picture frozen and, where a motion
+was recorded whose cause is known, a deformation field without physics that is fitted to it
+(`physics3d/learning/deformation_field.py`). All are judged by the take that nobody learned from. Of real takes, whose
+cause nobody knows, there is the table of what is foretold; METHODS=physics3d is enough for them.
+
+`compare_page.py` says what is written. Exit codes as `make sweep`.
+"""
+
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from pipeline.compare_page import FIELD, FILMED, METRICS, Row, write
+from pipeline.filed import filed, one_line
+from pipeline.settings import SettingsError, choices
+from pipeline.stage import StageError, Step, build, here, manifest
+from pipeline.sweep import OWN, Variant, asked, swept
+from pipeline.told import Table, parameters, scores
+
+WHOLE = "physics3d"
+
+
+def main(words: list[str]) -> int:
+    code: list[int] = []
+    failed = one_line(lambda: code.append(compare(words)), lambda text: print(text, file=sys.stderr))
+    return failed or code[0]
+
+
+def compare(words: list[str]) -> int:
+    """Run, judge, write. Raises as `filed` and the stages do."""
+    own = dict(word.partition("=")[::2] for word in words if word.partition("=")[0] in (*OWN, "out", "scene"))
+    rest = [word for word in words if word.partition("=")[0] not in (*OWN, "out", "scene", "method", "seed")]
+    scenes = own.get("scenes") or own.get("scene") or ""
+    methods = [m.strip() for m in (own.get("methods") or ",".join(choices("method"))).split(",") if m.strip()]
+    if WHOLE not in methods:
+        raise SettingsError(f"methods is {','.join(methods)}; take {WHOLE} among them, with which the others compare")
+    settings = [f"runner={own.get('runner') or 'thread'}", f"workers={own.get('workers') or '1'}", *rest]
+    crew, variants = asked([f"scenes={scenes}", f"methods={','.join(methods)}", *settings])
+    states = swept(crew, variants)
+    rows: list[Row] = []
+    lost: dict[tuple[str, str], str] = {}
+    for variant in variants:
+        state = str(states[variant]["state"])
+        if state != "done":
+            lost[variant.scene, variant.method] = state
+            continue
+        rows += of_variant(variant, rest)
+    output = Path(variants[0].config["output"]).expanduser().resolve()
+    folder = Path(own.get("out") or output / "comparisons" / "-".join(dict.fromkeys(v.scene for v in variants)))
+    if not rows:
+        raise StageError(f"no method ended on any scene: {next(iter(lost.values()))}")
+    write(folder, rows, lost, variants[0].config)
+    print(f"comparison {folder / 'compare.md'}")
+    return 1 if lost else 0
+
+
+def of_variant(variant: Variant, rest: list[str]) -> list[Row]:
+    """The row of a run; with the whole method also those of what needs no run of its own."""
+    from pipeline.moving import read
+
+    _, whole, steps = filed([f"scene={variant.scene}", f"method={variant.method}", *rest])
+    tables = scores(whole)
+    if not tables:
+        raise StageError(f"{variant.scene} has no recorded motion to compare with; leave it out of SCENES")
+    table, is_whole = tables[0], variant.method == WHOLE
+    if table.step == "foretell":
+        return [Row(scene=variant.scene, method=n, scores=_numbers(table, n)) for n in table.values if is_whole]
+    name = next(n for n in ("learned", "initial") if n in table.values)
+    found = Row(
+        scene=variant.scene,
+        method=variant.method,
+        scores=_numbers(table, name),
+        seconds=sum(_seconds(step) for step in steps.values() if not step.name.endswith("_initial")),
+        learned={p.name: f"{p.learned:.3g} ({p.between})" for p in parameters(whole) if p.low is not None},
+        video=read(steps["render"]).frames[0],
+    )
+    if not is_whole:
+        return [found]
+    capture = read(steps["capture"])
+    take = capture.take("evaluate") or capture.take("learn")
+    camera = (take.held_out_cameras or (0,))[0]
+    filmed = Row(scene=variant.scene, method=FILMED, scores={}, video=take.videos[camera])
+    still = [Row(scene=variant.scene, method=n, scores=_numbers(table, n)) for n in table.values if "frozen" in n]
+    return [filmed, *still, *deformed(variant, capture, steps), found]
+
+
+def _numbers(table: Table, row: str) -> dict[str, float]:
+    return {k: v for k, v in table.values[row].items() if k in METRICS and v is not None}
+
+
+def _seconds(step: Step) -> float:
+    return float(manifest(step)["seconds"])
+
+
+def deformed(variant: Variant, capture: Any, steps: dict[str, Step]) -> list[Row]:
+    """The row of the deformation field, fitted to the take that the others learned from; none where there is no such
+    take."""
+    import torch
+
+    from physics3d.learning.chain import chain_of
+    from physics3d.learning.deformation_field import fit_field
+    from physics3d.log import Log
+    from pipeline.moving import read
+
+    take = capture.take("learn")
+    if take is None:
+        return []
+    gaussians, body = read(steps["reconstruct"]) if "reconstruct" in steps else capture.gaussians, read(steps["fill"])
+    device = here(variant.config["device"])
+    learn, render, evaluate = (build(variant.config[name], device, name) for name in ("learn", "render", "evaluate"))
+    began = time.perf_counter()
+    chain = chain_of(
+        learn.world, learn.prior, learn.estimator, learn.field(learn.world.estimate(), speed=1.0), capture, gaussians,
+        body, take, torch.arange(len(take.videos[0])), image_scale=learn.image_scale, device=device, log=Log(None),
+    )  # fmt: skip
+    trajectory = fit_field(chain, body, fps=take.fps, seed=learn.seed, log=Log(None))
+    video = render(capture, gaussians, body, trajectory, log=Log(None))
+    seconds = sum(_seconds(steps[n]) for n in ("capture", "reconstruct", "segment", "fill") if n in steps)
+    seconds += time.perf_counter() - began
+    cells = evaluate(capture, {FIELD: video}, {}, log=Log(None)).values[FIELD]
+    values = {k: v for k, v in cells.items() if k in METRICS and v is not None}
+    return [Row(scene=variant.scene, method=FIELD, scores=values, seconds=seconds, video=video.frames[0])]
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,76 @@
+"""A thing that was never filmed: its material learned from what a video model holds probable, stage by stage as a run
+does it, with a small random Stable Video Diffusion; and what is said where weights are absent."""
+
+import pytest
+from small_scene import bar
+from tiny_models import save_stable_video
+
+from physics3d.gaussians.ply import write_ply
+from pipeline.flow import built, first, idle, plan, suit
+from pipeline.settings import compose
+from pipeline.stage import StageError, load, run
+
+SCENE = ("scene=trained", "profile=smoke", "device=cpu", "scene.dx=0.05", "scene.spacing=0.025", "simulate.frames=6")
+LEARNING = ("learn.frames=4", "learn.steps=1", "learn.search=2", "learn.image_scale=0.1")
+PRIOR = ("prior.variant=null", "prior.precision=float32", "prior.height=16", "prior.width=16")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    save_stable_video(folder / "svd")
+    write_ply(folder / "bar.ply", bar()[0])
+    return folder
+
+
+def words(folder, *more):
+    return [*SCENE, f"data={folder / 'bar.ply'}", f"output={folder}", "prior=stable_video", *PRIOR, *LEARNING, *more]
+
+
+def through(folder, *more):
+    """Every stage in its turn, as `pipeline.flow.execute` runs them, without a server; names and logs of all."""
+    config, _ = compose(words(folder, *more))
+    stages = built(config, "cpu")
+    capture = first(config, folder / "artifacts")
+    run(capture, "cpu")
+    whole = plan(config, capture)
+    suit(stages, load(capture, "cpu").outline, idle(config) | whole.left_out)
+    for step in whole.steps:
+        run(step, "cpu")
+    return whole
+
+
+def test_material_is_learned_from_what_a_video_model_holds_probable(folder):
+    whole = through(folder, f"prior.model={folder / 'svd'}")
+    names = [step.name for step in whole.steps]
+    assert names == ["capture", "guess", "fill", "learn", "simulate", "render"]
+    assert set(whole.left_out) == {"reconstruct", "segment", "evaluate"}
+    learn = whole.steps[names.index("learn")]
+    told = (learn.folder / "log.txt").read_text()
+    assert "from take imagined: 4 frames" in told and "GB on cpu" in told and "no intervals" in told
+    assert "4 frames are shown to a prior that was trained on clips of" in told
+    estimate, guess = load(learn, "cpu"), load(whole.steps[1], "cpu")
+    moved = [k for k, v in estimate.parameters.items() if float(v) != float(guess.parameters[k])]
+    assert moved and all(bool(estimate.parameters[name].isfinite().all()) for name in moved)
+    assert learn.fingerprint != through(folder, f"prior.model={folder / 'svd'}", "prior.fps=8.0").steps[3].fingerprint
+
+
+@pytest.mark.parametrize("prior", ["stable_video", "modelscope", "wan", "wan_image"])
+def test_absent_weights_are_one_line_before_anything_is_computed(tmp_path, folder, prior):
+    config, _ = compose(
+        [
+            *SCENE,
+            *LEARNING,
+            f"data={folder / 'bar.ply'}",
+            f"output={tmp_path}",
+            f"prior={prior}",
+            "prior.model=./nowhere",
+        ]
+    )
+    built(config, "cpu")
+    capture = first(config, tmp_path / "artifacts")
+    run(capture, "cpu")
+    with pytest.raises(StageError, match=r"learn: prior\.model=\./nowhere is not a folder") as caught:
+        plan(config, capture)
+    assert "\n" not in str(caught.value)
+    assert [path.name for path in (tmp_path / "artifacts").glob("[!.]*")] == ["capture"]
