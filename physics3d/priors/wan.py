@@ -188,7 +188,7 @@ class Wan(AbstractPrior):
             time[0] = 0  # known without noise
             time = time.reshape(1, -1)
         with lent(pipe.transformer, self.device, back=self.offload) as network:
-            video = sample.transpose(0, 1)[None].to(network.dtype)
+            video = sample.transpose(0, 1)[None].to(next(network.parameters()).dtype)
             # one after the other: half the memory of both at once
             without, given = (
                 network(video, time.to(video.device), text[None].to(video), return_dict=False)[0][0].float()
