@@ -10,8 +10,16 @@ from pipeline.flow import built, first, idle, plan, suit
 from pipeline.settings import compose
 from pipeline.stage import StageError, load, run
 
-SCENE = ("scene=trained", "profile=smoke", "device=cpu", "scene.dx=0.05", "scene.spacing=0.025", "simulate.frames=6")
-LEARNING = ("learn.frames=4", "learn.steps=1", "learn.search=2", "learn.image_scale=0.1")
+# the bar of small_scene, poked at its top as there
+POKE = (
+    "{_target_: physics3d.boundaries.impulse.Impulse, force: [0.0, 0.0, 0.0], centre: [0.0, 0.0, 0.4], radius: 0.12, "
+)
+SCENE = (
+    "scene=trained", "profile=smoke", "device=cpu", "scene.dx=0.05", "scene.spacing=0.025", "simulate.frames=6",
+    "scene.gravity=[0.0,0.0,0.0]", "scene.boundaries.0.kind=sticky", "scene.boundaries.0.point=[0.0,0.0,0.06]",
+    f"scene.excitation=[{POKE}start: 0.0, duration: 0.1}}]", "simulate.force.x=1.2",
+)  # fmt: skip
+LEARNING = ("learn.frames=4", "learn.steps=1", "learn.search=0", "learn.image_scale=0.1")
 PRIOR = ("prior.variant=null", "prior.precision=float32", "prior.height=16", "prior.width=16")
 
 
