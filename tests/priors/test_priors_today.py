@@ -114,8 +114,9 @@ def test_a_perfect_network_gives_no_gradient(models, name, monkeypatch):
 
 @pytest.mark.parametrize("name", WANS)
 def test_half_precision_is_the_same_up_to_its_rounding(models, name):
-    """Some layers stay in float32 by themselves. 5 %: bfloat16 has 8 bits, a few tens of layers follow each other."""
-    exact, video = models[name], clip(4)
+    """Some layers stay in float32 by themselves. 5 %: bfloat16 has 8 bits, a few tens of layers follow each other;
+    guidance, which would enlarge the difference, is off."""
+    exact, video = replace(models[name], guidance=1.0), clip(4)
     half = replace(exact, precision="bfloat16", vae_precision="bfloat16")
     z0, rounded = exact.encode(video), half.encode(video)
     assert rounded.dtype == torch.float32 and float((rounded - z0).norm() / z0.norm()) < 0.05
