@@ -50,9 +50,7 @@ class Wan(AbstractPrior):
     first_image: bool = False  # whether it is told the first image too; Wan2.2-TI2V-5B takes one
     clip_frames: Frames = 81  # of the clips that it was trained on; 2.2: 121
     precision: Precision = "bfloat16"  # of the network and the text encoder; float32 on a CPU
-    vae_precision: Precision = (
-        "bfloat16"  # of the VAE, on the way from the pixels and back; float32 takes twice as much
-    )
+    vae_precision: Precision = "bfloat16"  # of the VAE, from the pixels and back; float32 takes twice as much
     offload: bool = False  # whether the network waits in the machine's memory while the VAE works
     device: Device = "cuda"
     height: Annotated[Pixels, MultipleOf(16)] = 480  # what the network sees [px]; 2.2: a multiple of 32
@@ -188,7 +186,8 @@ class Wan(AbstractPrior):
             time[0] = 0  # known without noise
             time = time.reshape(1, -1)
         with lent(pipe.transformer, self.device, back=self.offload) as network:
-            video = sample.transpose(0, 1)[None].to(next(network.parameters()).dtype)
+            # not that of its first parameter: some are kept in float32
+            video = sample.transpose(0, 1)[None].to(pipe.transformer.dtype)
             # one after the other: half the memory of both at once
             without, given = (
                 network(video, time.to(video.device), text[None].to(video), return_dict=False)[0][0].float()
