@@ -182,7 +182,7 @@ def coarse(made: Scene, position: np.ndarray, volume: np.ndarray, seconds: float
 
 def test_the_motion_is_seen_and_stays_in_the_room(made):
     position, volume = matter(made.twin.name)
-    path = coarse(made, position, volume, 4 / 15)
+    path = coarse(made, position, volume, 3 / 15)
     twin = made.twin
     camera = witness(WIDTH, WIDTH * 3 // 4, target=twin.target, distance=twin.distance, opening=twin.opening)
     pixels = np.stack([camera.project(torch.from_numpy(x).double())[0].numpy() for x in path])
