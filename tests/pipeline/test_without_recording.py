@@ -20,7 +20,7 @@ SCENE = (
     f"scene.excitation=[{POKE}start: 0.0, duration: 0.1}}]", "simulate.force.x=1.2",
     "scene.source.views=8", "scene.source.width=64", "scene.source.height=48",
 )  # fmt: skip
-LEARNING = ("learn.frames=4", "learn.steps=1", "learn.search=0", "learn.image_scale=1.0")
+LEARNING = ("learn.frames=4", "learn.steps=2", "learn.search=0", "learn.image_scale=1.0")
 PRIOR = ("prior.variant=null", "prior.precision=float32", "prior.height=16", "prior.width=16")
 
 
