@@ -107,13 +107,13 @@ def draw(rows: list[Row]) -> Any:
             if row["twin"] != first or row.get("by") == "solver":
                 continue
             if row["section"] == "landscape":
-                axes[0].plot(GRID, curve / curve.min(), label=f"noise {row['range']}")
+                axes[0].plot(GRID, curve / curve.max(), label=f"noise {row['range']}")
             elif row["section"] == "gradient" and row["range"] == "3-30":
                 axes[1].plot(GRID[::2], curve / np.abs(curve).max(), label=row["estimator"])
             elif row["section"] == "distil":
                 number = list(ESTIMATORS).index(row["estimator"])
                 axes[2].plot(curve, color=f"C{number}", label=row["estimator"] if row["start"] > 1 else None, lw=1)
-        axes[0].set(title=f"{prior}: denoising loss / lowest", xlabel="theta = ln(E/mode)", yscale="log")
+        axes[0].set(title=f"{prior}: denoising loss / highest", xlabel="theta = ln(E/mode)", yscale="log")
         axes[1].set(title="mean gradient / largest, noise 3-30", xlabel="theta = ln(E/mode)")
         axes[1].axhline(0, color="0.7", lw=0.8)
         axes[2].set(title="theta along the descent", xlabel="step")

@@ -104,18 +104,21 @@ class Learn:
         self.field(self.world.estimate(), speed=1.0)
 
     def fits(self, outline: Outline) -> None:
-        """Raise ValueError if a take of this outline is too short, as far as that is known."""
+        """Raise ValueError if a take of this outline is too short, or the prior too large for its device, as far as
+        that is known."""
         recorded = [take for take in outline.takes or () if take.role == "learn"]
         if not recorded and outline.takes is not None and self.imagined is not None and not self.prior.needs_clip:
             recorded = [self.imagined.footage]
         for take in recorded:
-            self.spread(take)
+            if memory := self.prior.memory(len(self.spread(take))):
+                memory.require()
 
     def __call__(self, capture: Capture, gaussians: Gaussians, body: Body, *, log: Log) -> Estimate:
         """Raises ValueError if there is no take to learn from, or a name, frame count or camera does not fit."""
         take = capture.take("learn")
         if take is None and self.imagined is not None and not self.prior.needs_clip:
-            take = self.imagined.take(capture, gaussians, device=self.device)
+            falls = any(self.world.gravity) or any(self.world.velocity)
+            take = self.imagined.take(capture, gaussians, falls=falls, device=self.device)
         if take is None:
             raise ValueError(
                 f"capture {capture.name} has no take with role learn; leave out the learning, record a motion, or take "
@@ -131,6 +134,8 @@ class Learn:
         start = self.world.estimate()
         section = look_ahead(body, self.world, take.excitation, log)
         indices = self.spread(take.footage)
+        if memory := self.prior.memory(len(indices)):
+            log.info(f"the prior takes {memory.require()}")
         seconds = int(indices[-1]) / take.fps
         whole = self.field(start, speed=self.natural_speed(body, seconds))
 
@@ -241,6 +246,7 @@ class Learn:
                 f"learn.frames is {count}{why}, but take {take.name} has {total} frames"
                 f"{'' if self.duration is None else f' in {self.duration:g} s'}; lower it or raise learn.duration"
             )
+        self.prior.require_frames(self.frames_per_step or count)
         stride, rest = divmod(total - 1, count - 1)
         if rest < stride:
             return torch.arange(count) * stride

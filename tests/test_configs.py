@@ -220,7 +220,7 @@ def test_what_is_mentioned_exists(key):
 COUNTED = re.compile(
     r"(^|\.)(seed|views|width|height|frames|iterations|max_gaussians|longest_side|sh_degree|check_every|patience|size|"
     r"rounds|steps|frames_per_step|views_per_step|polish|search|paint|every|most_points|image_size|motion_bucket|"
-    r"branches|max_substeps|held_out_cameras\.\d+|view|checkpoint_bytes|copies|curls|flutes|veins)$"
+    r"branches|max_substeps|held_out_cameras\.\d+|view|checkpoint_bytes|clip_frames|copies|curls|flutes|veins)$"
 )
 SIGNED = re.compile(
     r"(gravity|velocity|point|normal|force|acceleration_of_each|centre|lower|upper|up)\.(\d|[xyz])$|(poissons_ratio|quadratic_coefficient)$|"

@@ -32,10 +32,11 @@ class Imagined:
     def footage(self) -> Footage:
         return Footage(name="imagined", role="learn", frames=self.frames, fps=self.fps)
 
-    def take(self, capture: Capture, gaussians: Gaussians, *, device: str) -> Take:
-        """Raises ValueError if nothing sets the body in motion or the view is not in the capture."""
+    def take(self, capture: Capture, gaussians: Gaussians, *, falls: bool, device: str) -> Take:
+        """`falls`: it moves by itself, by its weight or because it is thrown. Raises ValueError if nothing sets the
+        body in motion or the view is not in the capture."""
         excitation = excited(self.excitation, self.force)
-        if not excitation:
+        if not excitation and not falls:
             raise ValueError(
                 "nothing was recorded and nothing pushes the body (simulate.force is zero or simulate.excitation is "
                 "empty), so a video model would be shown a still picture; set simulate.force"

@@ -9,9 +9,11 @@ and `x0_hat(z_t)` is the prior's estimate of z0. Networks differ in what they pu
 
     epsilon         n                                   x0 = (z_t - sigma out) / alpha
     v_prediction    (alpha n - sigma z0) / r            x0 = (alpha z_t / r - sigma out) / r
+    flow_prediction n - z0                              x0 = (z_t - sigma out) / (alpha + sigma)
 
-v: Salimans and Ho (2022). Stable Video Diffusion is v_prediction with alpha = 1, ModelScope is epsilon with
-alpha^2 + sigma^2 = 1.
+v: Salimans and Ho (2022); flow: Lipman et al. (2023), the velocity of a straight line from picture to noise. Stable
+Video Diffusion is v_prediction with alpha = 1, ModelScope is epsilon with alpha^2 + sigma^2 = 1, Wan is flow_prediction
+with alpha + sigma = 1.
 """
 
 import math
@@ -22,6 +24,8 @@ from typing import Any, ClassVar
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from physics3d.priors.memory import Memory
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,6 +53,15 @@ class AbstractPrior(ABC):
     @property
     def trained_frames(self) -> int | None:
         """So many frames had the clips that it was trained on; None: any number is as good."""
+        return None
+
+    def require_frames(self, frames: int) -> None:
+        """Raises ValueError, naming the nearest right numbers, if it cannot be shown clips of so many frames."""
+        return None
+
+    def memory(self, frames: int) -> Memory | None:
+        """What it will take to show it clips of so many frames, known before its weights are loaded; None: next to
+        nothing. Raises ValueError if the model's files are not there, or do not fit its options."""
         return None
 
     @abstractmethod
@@ -98,7 +111,9 @@ def x0_from(prediction: str, output: Tensor, z_t: Tensor, level: Level) -> Tenso
             return (z_t - sigma * output) / alpha
         case "v_prediction":
             return (alpha * z_t / r - sigma * output) / r
+        case "flow_prediction":
+            return (z_t - sigma * output) / (alpha + sigma)
     raise ValueError(
-        f"prediction is {prediction!r}; known are epsilon and v_prediction; take weights whose scheduler has one of "
-        "these as its prediction_type"
+        f"prediction is {prediction!r}; known are epsilon, v_prediction and flow_prediction; take weights whose "
+        "scheduler has one of these as its prediction_type"
     )

@@ -1,23 +1,67 @@
 """Where published weights come from: a local folder, else the hub's cache, else the hub, else one clear message."""
 
+import importlib
+import inspect
+import json
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
 
 Precision = Literal["float16", "bfloat16", "float32"]
+Dtypes = torch.dtype | dict[str, torch.dtype]  # of all networks, or of each by name and of the "default"
 
 
-def load_pipeline(kind: Any, name: str, *, key: str, dtype: torch.dtype, variant: str | None) -> Any:
-    """A diffusers pipeline of class `kind` from `name`, a folder or a hub repository.
+def load_pipeline(
+    kind: Any, name: str, *, key: str, dtype: Dtypes, variant: str | None, without: tuple[str, ...] = ()
+) -> Any:
+    """A diffusers pipeline of class `kind` from `name`, a folder or a hub repository; parts named in `without` are
+    not loaded.
 
     Raises ValueError naming the configuration key and what was tried, after at most one short look at the network.
     """
     folder = pipeline_folder(kind, name, key=key, variant=variant)
+    absent: dict[str, Any] = dict.fromkeys(without)
     try:
-        return kind.from_pretrained(folder, local_files_only=True, dtype=dtype, variant=variant)
+        return kind.from_pretrained(folder, local_files_only=True, dtype=dtype, variant=variant, **absent)
     except (OSError, ValueError, AttributeError) as error:
         raise ValueError(f"{key}={name}: no {kind.__name__} can be read from {folder}: {error}") from error
+
+
+def hollow_pipeline(
+    kind: Any, name: str, *, key: str, dtype: Dtypes, variant: str | None, without: tuple[str, ...] = ()
+) -> Any:
+    """The same pipeline with all its networks on torch's meta device: shapes, and no weights. Raises ValueError as
+    `load_pipeline`."""
+    folder = pipeline_folder(kind, name, key=key, variant=variant)
+    dtypes = dtype if isinstance(dtype, dict) else {"default": dtype}
+    try:
+        index, known = json.loads((folder / "model_index.json").read_text()), inspect.signature(kind).parameters
+        parts = {part: None if part in without else made for part, made in index.items() if part in known}
+        for part, named in parts.items():
+            if isinstance(named, list):
+                parts[part] = hollow(named, folder / part, dtypes.get(part, dtypes["default"]))
+        return kind(**parts)
+    except (OSError, ValueError, AttributeError, TypeError) as error:
+        raise ValueError(f"{key}={name}: no {kind.__name__} can be read from {folder}: {error}") from error
+
+
+def hollow(named: list[str | None], folder: Path, dtype: torch.dtype) -> Any:
+    """One part of a pipeline, [library, class] in its index: a network without weights, or the whole of what has
+    none."""
+    library, name = named
+    if library is None or name is None:
+        return None
+    kind = getattr(importlib.import_module(library), name)
+    if not issubclass(kind, torch.nn.Module):
+        return kind.from_pretrained(folder)
+    with torch.device("meta"):
+        if hasattr(kind, "load_config"):  # of diffusers
+            network = kind.from_config(kind.load_config(folder, local_files_only=True))
+        else:  # of transformers
+            network = kind(kind.config_class.from_pretrained(folder, local_files_only=True))
+    # some make a tensor wherever they are; not by its own `to`, which warns of what loading would keep precise
+    return torch.nn.Module.to(network.requires_grad_(False).eval(), "meta", dtype)
 
 
 def pipeline_files(kind: Any, name: str, *, key: str, variant: str | None) -> tuple[str, ...]:

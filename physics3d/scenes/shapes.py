@@ -50,7 +50,8 @@ class AbstractShape(abc.ABC):
     def tone(self, along: Float[np.ndarray, " a"], around: int) -> Float[np.ndarray, "a b"]:
         """How much of the second colour is where, 0..1; `along` is the share of the length."""
         inside = [(along >= a) & (along <= b) for a, b in self.bands]
-        return np.repeat(np.any(inside, 0)[:, None] if inside else np.zeros((len(along), 1)), around, 1)
+        banded = np.any(inside, 0) if inside else np.zeros(len(along), bool)
+        return np.repeat(banded[:, None], around, 1).astype(np.float64)
 
     def meshes(self, seed: int, *, moves: bool) -> list[Mesh]:
         """One for each copy; the seed is that of the mottling."""

@@ -16,6 +16,7 @@ LEVELS = {  # (alpha, sigma) that each parametrisation is used with
     "epsilon": (0.8, 0.6),
     "v_prediction": (0.8, 0.6),
     "v_prediction in sigma space": (1.0, 3.0),
+    "flow_prediction": (0.4, 0.6),
 }
 
 
@@ -36,6 +37,8 @@ def network_output(prediction, z0, noise, level):
             return noise
         case "v_prediction":
             return (level.alpha * noise - level.sigma * z0) / r
+        case "flow_prediction":
+            return noise - z0
 
 
 @pytest.mark.parametrize("case", LEVELS)

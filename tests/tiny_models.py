@@ -87,3 +87,27 @@ def save_modelscope(folder):
     )
     scheduler = DDIMScheduler(beta_start=0.00085, beta_end=0.012, beta_schedule="scaled_linear", clip_sample=False)
     TextToVideoSDPipeline(vae, text, tokenizer, unet, scheduler).save_pretrained(folder)
+
+
+def save_wan(folder, *, image):
+    """Text to video as of Wan 2.1, or with a first image as of Wan 2.2 TI2V: the same classes, a thousandth as wide."""
+    from diffusers import AutoencoderKLWan, UniPCMultistepScheduler, WanPipeline, WanTransformer3DModel
+    from transformers import T5TokenizerFast, UMT5Config, UMT5EncoderModel
+
+    torch.manual_seed(0)
+    words = [("<pad>", 0.0), ("</s>", 0.0), ("<unk>", -9.0), ("▁a", -1.0), ("▁flower", -2.0), ("▁sways", -3.0)]
+    tokenizer = T5TokenizerFast(vocab=words, extra_ids=0)
+    text = UMT5EncoderModel(
+        UMT5Config(vocab_size=len(words), d_model=16, d_kv=8, d_ff=16, num_layers=1, num_heads=2)
+    ).eval()
+    new = {"is_residual": True, "in_channels": 12, "out_channels": 12, "patch_size": 2, "scale_factor_spatial": 16}
+    vae = AutoencoderKLWan(
+        base_dim=8, z_dim=4, num_res_blocks=1, latents_mean=[0.1, -0.2, 0.3, 0.0], latents_std=[0.5, 0.7, 1.1, 0.9],
+        **(new if image else {}),
+    )  # fmt: skip
+    network = WanTransformer3DModel(
+        num_attention_heads=2, attention_head_dim=12, in_channels=4, out_channels=4, text_dim=16, freq_dim=8,
+        ffn_dim=32, num_layers=2,
+    )  # fmt: skip
+    scheduler = UniPCMultistepScheduler(prediction_type="flow_prediction", use_flow_sigmas=True, flow_shift=3.0)
+    WanPipeline(tokenizer, text, vae, scheduler, network, expand_timesteps=image).save_pretrained(folder)
