@@ -272,6 +272,8 @@ def legal(key: str, old: Any, new: Any) -> bool | None:
             return None  # a viscoelastic solid may have its elastic branch alone, a solid with branches needs one
         if re.search(r"\.normal\.|\.up\.|\.across\.", key):
             return None
+        if key.startswith("learn.guess_widths."):
+            return False  # a width, whatever it is the width of
         return bool(SIGNED.search(key) or ZERO_IS_FINE.search(key))
     return False if COUNTED.search(key) else None  # 1.5
 
