@@ -183,7 +183,7 @@ def complaint(hint: Any, value: Any, name: str, elsewhere: Elsewhere = lambda hi
             options = [option for option in get_args(bare) if not hasattr(option, "tolist")]  # arrays are lists here
             found = [complaint(option, value, name, elsewhere) for option in options]
             good = None in found
-            alike = [text for option, text in zip(options, found) if _same_kind(_apart(option)[0], value)]
+            alike = [text for option, text in zip(options, found) if _may_mean(_apart(option)[0], value)]
             inside = alike[0] if len(alike) == 1 and not good else None
         case typing.Literal:
             good = any(value == choice and type(value) is type(choice) for choice in get_args(bare))
@@ -208,6 +208,12 @@ def complaint(hint: Any, value: Any, name: str, elsewhere: Elsewhere = lambda hi
 
 
 SIMPLE = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
+
+
+def _may_mean(bare: Any, value: Any) -> bool:
+    """Whether a value is of that kind, or a mapping that has to become an object of that class."""
+    is_class = isinstance(bare, type) and bare not in (*SIMPLE, type(None))
+    return _same_kind(bare, value) or (is_class and isinstance(value, dict) and "_target_" in value)
 
 
 def describe(hint: Any) -> str:

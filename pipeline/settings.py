@@ -44,6 +44,7 @@ def compose(words: list[str]) -> tuple[dict[str, Any], dict[str, str]]:
             picked = {g: config.hydra.runtime.choices[g] for g in GROUPS if g in config.hydra.runtime.choices}
             OmegaConf.set_struct(config, False)
             del config["hydra"]
+            _of_the_material(config, picked, words)
             _by_the_handbook(config, picked)
             written = OmegaConf.to_container(config, resolve=False)
             composed = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))
@@ -57,6 +58,18 @@ def compose(words: list[str]) -> tuple[dict[str, Any], dict[str, str]]:
     if wrong:
         raise SettingsError(wrong)
     return composed, picked
+
+
+def _of_the_material(config: Any, picked: dict[str, str], words: list[str]) -> None:
+    """Leave out where a scene lets parameters start that the material chosen for it has not, but others have: those of
+    a branch, say, under METHOD=without_viscoelastic. What is on the command line stays, and is refused."""
+    from omegaconf import OmegaConf
+
+    names = {kind: set(OmegaConf.load(CONF / "material" / f"{kind}.yaml").start) for kind in choices("material")}
+    known, said = set().union(*names.values()), {word.partition("=")[0] for word in words}
+    for name in set(config.material.start) & known - names[picked["material"]]:
+        if f"material.start.{name}" not in said:
+            del config.material.start[name]
 
 
 def _by_the_handbook(config: Any, picked: dict[str, str]) -> None:

@@ -219,7 +219,7 @@ def test_what_is_mentioned_exists(key):
 
 COUNTED = re.compile(
     r"(^|\.)(seed|views|width|height|frames|iterations|max_gaussians|longest_side|sh_degree|check_every|patience|size|"
-    r"rounds|steps|frames_per_step|views_per_step|polish|search|paint|every|most_points|image_size|motion_bucket|"
+    r"rounds|steps|frames_per_step|views_per_step|polish|search|paint|nodes|every|most_points|image_size|motion_bucket|"
     r"branches|max_substeps|held_out_cameras\.\d+|view|checkpoint_bytes|clip_frames|copies|curls|flutes|veins)$"
 )
 SIGNED = re.compile(
@@ -228,7 +228,7 @@ SIGNED = re.compile(
     r"(fold|curl_height)$"
 )
 ZERO_IS_FINE = re.compile(
-    r"(^|\.)(seed|sh_degree|rounds|steps|frames_per_step|views_per_step|polish|search|paint|motion_bucket|branches|view|"
+    r"(^|\.)(seed|sh_degree|rounds|steps|frames_per_step|views_per_step|polish|search|paint|nodes|motion_bucket|branches|view|"
     r"damping|friction|start|stay|ssim_weight|opacity|drop_pieces_below|opacity_weight|scale_weight|noise|noise_strength|"
     r"enclosure|hardening|hardening_modulus|second_modulus|cubic_modulus|viscosity|power_index|checkpoint_bytes|held_out_cameras\.\d+)$|"
     r"rates\.(?!final)\w+$|beyond\.\w+$|blur\.\d$|(positive|negative)\.\d+\.\d$|(colour|second|half_widths)\.\d+$|"
@@ -239,7 +239,7 @@ NULL_IS_FINE = re.compile(
     r"(resolution|sheet_thickness|learn\.(duration|frames)|floaters|variant|simulate\.force|render\.view|world\.(dt|checkpoint_bytes)|"
     r"prompts\.\d\.box|veins)$"
 )
-WORD_IS_FINE = re.compile(r"(prompts\.\d\.view|render\.view)$")
+WORD_IS_FINE = re.compile(r"(prompts\.\d\.view|render\.view|prior\.weights)$")
 CHOICES = re.compile(r"(kind|precision|scheme|solver|spring|flow|isolated|attach|device|learn\.\d+|ties\.\d\.\d)$")
 ORDERED = re.compile(r"(lower|upper|box|sigma|time)\.\d$")  # whether one number can be depends on its neighbours
 BAD = [math.nan, math.inf, -1, 0, 1e30, 1.5, "word", ["a", "list"], None]

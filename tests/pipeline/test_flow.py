@@ -78,13 +78,13 @@ def test_what_is_left_out_says_the_time_it_took_elsewhere(tmp_path):
 @pytest.mark.parametrize(
     "word, message",
     [
-        ("learn.duration=0.1", r"learn: learn\.frames is 15, but take learn has 4 frames in 0\.1 s"),
+        ("learn.frames=15 learn.duration=0.1", r"learn: learn\.frames is 15, but take learn has 4 frames in 0\.1 s"),
         ("scene.prompts.0.view=view_040", r"segment: prompt: view 'view_040' is not in carnation; .*view_000"),
         ("scene.prompts=[]", r"segment: segment\.prompts is empty and carnation has no mattes"),
     ],
 )
 def test_a_stage_that_cannot_take_the_scene_is_refused_before_the_scene_is_made(word, message):
-    config, _ = compose(["scene=carnation", word])
+    config, _ = compose(["scene=carnation", *word.split()])
     stages = {name: build(config[name], "cpu", name) for name in STAGES}
     with pytest.raises(StageError, match=message):
         suit(stages, stages["capture"].source.outline, {})
@@ -141,7 +141,8 @@ def test_a_run_its_record_and_the_run_after_it(tmp_path, prefect):
     assert process.returncode == 0, out + err
     assert "computed" in out and "reused" not in out and address(tmp_path) in out
     table = [line.split() for line in out.splitlines()]
-    assert ["youngs_modulus", "1", "1.5", "as", "given", "2"] in table  # start, learned, no interval, truth
+    # start, learned, no interval, truth
+    assert ["youngs_modulus", "1", "1.5", "no", "interval", "is", "known", "2"] in table
     assert ["learned", "11", "-"] in table, out  # every stage added its 1 to what it was given
 
     with sqlite3.connect(tmp_path / "mlflow.db") as record:

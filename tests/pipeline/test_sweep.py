@@ -113,7 +113,7 @@ def test_every_combination_is_a_variant():
     "words, message",
     [
         (["methods=physics3d"], r"scenes is empty; say SCENES="),
-        (["scenes=ball,nowhere"], r"no scene 'nowhere'; there are ball"),
+        (["scenes=ball,nowhere"], r"no scene 'nowhere'; there are alocasia, ball"),
         (["scenes=ball", "runner=cloud"], r"runner is 'cloud'; take one of thread, process, dask, ray"),
         (["scenes=ball", "workers=0"], r"workers is '0'; take a number from 1 to 9999"),
         (["scenes=ball", "runner=process", "address=tcp://x:1"], r"address=tcp://x:1: runner=process stays on this"),

@@ -68,7 +68,7 @@ def test_the_command_composes_what_the_checkout_composes_from_any_folder(install
 def test_a_mistake_on_the_command_line_is_one_line(installed, tmp_path):
     for words, code, text in (
         (["walk"], 2, "error: no verb 'walk'; there are run, why, "),
-        (["run", "scene=nowhere"], 2, "error: no scene 'nowhere'; there are ball, "),
+        (["run", "scene=nowhere"], 2, "error: no scene 'nowhere'; there are alocasia, ball, "),
         (["why", "learn.stepps=3"], 2, "error: no 'stepps' in learn; did you mean learn.steps?"),
         (["pin", "learn/0"], 1, "error: RESULT=learn/0 is none of those in artifacts; take RESULT="),
         (["collect"], 1, "error: no record of runs in mlflow.db, "),

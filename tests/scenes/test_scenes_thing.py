@@ -19,9 +19,10 @@ from physics3d.motion.decay import Decay
 from physics3d.scenes.base import Capture, Take
 from physics3d.scenes.carnation import TARGET
 from physics3d.scenes.clips import FilmedTake
-from physics3d.scenes.flower import plant, surroundings, wood
+from physics3d.scenes.flower import plant, surroundings
 from physics3d.scenes.handed_over import hand_over
 from physics3d.scenes.lens import Lens
+from physics3d.scenes.room import wood
 from physics3d.scenes.studio import Light, Studio, photographs, ring
 from physics3d.scenes.thing import ThingSource, _straightened
 from physics3d.video import write_mp4
