@@ -239,7 +239,7 @@ NULL_IS_FINE = re.compile(
     r"(resolution|sheet_thickness|learn\.(duration|frames)|floaters|variant|simulate\.force|render\.view|world\.(dt|checkpoint_bytes)|"
     r"prompts\.\d\.box|veins)$"
 )
-WORD_IS_FINE = re.compile(r"(prompts\.\d\.view|render\.view|prior\.weights)$")
+WORD_IS_FINE = re.compile(r"(capture\.clip|prompts\.\d\.view|render\.view|prior\.weights)$")
 CHOICES = re.compile(r"(kind|precision|scheme|solver|spring|flow|isolated|attach|device|learn\.\d+|ties\.\d\.\d)$")
 ORDERED = re.compile(r"(lower|upper|box|sigma|time)\.\d$")  # whether one number can be depends on its neighbours
 BAD = [math.nan, math.inf, -1, 0, 1e30, 1.5, "word", ["a", "list"], None]
