@@ -33,7 +33,7 @@ export $(words)
 
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup run why sweep compare pin unpin collect score twin train-prior fit-curves export still film report ui graph view test newest bench lint \
+.PHONY: help setup run why sweep compare pin unpin collect score twin reference-motion train-prior fit-curves export still film report ui graph view test newest bench lint \
 	handbook scenes configuration architecture clean
 py := .venv/bin/python
 # torch's own threads spin beside those of the renderer and the simulator: OMP_NUM_THREADS=1 unless you say otherwise
@@ -92,6 +92,9 @@ score: $(ready) ## any two videos compared: REAL=<clip> PRED=<clip> [OUT=<folder
 
 twin: $(ready) ## a thing with known material as photographs and clips on disk: OUT=<new folder>
 	@$(threads) $(py) -m pipeline.twin
+
+reference-motion: $(ready) ## how a twin moves by finite elements, kept for its scene: [ARGS="scene.source.seed=1"]; pip install pytetwild pyvista
+	@$(threads) $(with_args) -m pipeline.reference_motion $(of_run)
 
 train-prior: $(ready) ## a small video model from films it makes; goes on where it was: [OUT=outputs/tiny_video] [ARGS="steps=... seed=0 device=cpu"]
 	@$(threads) $(with_args) -m pipeline.train_prior

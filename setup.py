@@ -8,6 +8,7 @@ setup(
     package_data={
         "pipeline.conf": ["**/*.yaml"],
         "pipeline": ["pages/*"],
+        "physics3d.scenes": ["motions/*.npz"],  # made by make reference-motion
         "physics3d.priors": ["tiny_video_weights/*"],  # made by make train-prior
     },
 )

@@ -25,7 +25,7 @@ from physics3d.checks import (
     require_fields,
 )
 from physics3d.filling.body import Body
-from physics3d.filling.in_world import look_ahead
+from physics3d.filling.in_world import look_ahead, say_resolution
 from physics3d.filling.section import Section
 from physics3d.gaussians.model import Gaussians
 from physics3d.learning.chain import chain_of
@@ -156,6 +156,8 @@ class Learn:
             )
 
         chain = chained(whole, log)
+        if chain.on_grid and self.world.solver == "auto":  # otherwise said already
+            say_resolution(section, self.world.dx, log)
         trained = self.prior.trained_frames
         if trained not in (None, len(indices)):
             log.warn(f"{len(indices)} frames are shown to a prior that was trained on clips of {trained}")
@@ -197,7 +199,7 @@ class Learn:
             parameters={name: v.detach().to(torch.float32) for name, v in field.parameters(theta).items()},
             velocity=field.velocity(theta).detach().to(torch.float32),
             history=known,
-            intervals=self.intervals(field, theta, seen, section, log) if seen else {},
+            intervals=self.intervals(field, theta, seen, section if chain.on_grid else None, log) if seen else {},
         )
         self.report(capture, field, learned, seen, log)
         if log.folder is not None:
@@ -281,10 +283,10 @@ class Learn:
     def intervals(
         self, field: AbstractField, theta: Tensor, seen: Shown, section: Section | None, log: Log
     ) -> dict[str, Interval]:
-        """Of every learned number. `section`: the thinnest beside what is held, by which the grid may be coarser than
+        """Of every learned number. `section`: the thinnest beside what is held, by which a grid may be coarser than
         is usual."""
         beyond = self.beyond
-        if section is not None and self.world.solver == "grid":
+        if section is not None:
             beyond = replace(beyond, grid=max(beyond.grid, 2 * section.grid_error(self.world.dx)))
         unit = field.velocity_scale or 1.0
         speed = [float(v) / unit for v in field.velocity(theta)] if field.velocity_scale else []

@@ -8,7 +8,7 @@ from physics3d.boundaries.base import AbstractBoundary
 from physics3d.boundaries.impulse import Force, excited, has_force
 from physics3d.checks import Device, Frames, Rate, require_fields
 from physics3d.filling.body import Body
-from physics3d.filling.in_world import look_ahead
+from physics3d.filling.in_world import look_ahead, say_resolution
 from physics3d.log import Log
 from physics3d.solver import motion_of
 from physics3d.trajectory import Trajectory
@@ -39,7 +39,7 @@ class Simulate:
         """Raises ValueError as `check`, `look_ahead` and `rollout` do."""
         self.check()
         excitation = excited(self.excitation, self.force)
-        look_ahead(body, self.world, excitation, log)
+        section = look_ahead(body, self.world, excitation, log)
         with torch.no_grad():
             part = lambda values: self.world.material.per_part(values, body.part, body.parts)
             motion = motion_of(
@@ -52,6 +52,8 @@ class Simulate:
                 device=self.device,
                 log=log,
             )
+            if motion.modes is None and self.world.solver == "auto":  # otherwise said already
+                say_resolution(section, self.world.dx, log)
             parameters = part(estimate.parameters)
             motion.report(parameters)
             trajectory = motion(

@@ -85,17 +85,20 @@ def _say_held(body: Body, world: World, setting: Setting, log: Log) -> Section |
     log.info(f"held: {', '.join(said)}" if said else "nothing holds the body still")
     position, volume = (a.double().cpu().numpy() for a in (body.position, body.volume))
     section = thinnest_section(position, volume, np.asarray(held), body.spacing)
-    if section is None:
-        return None
-    if world.solver != "grid":  # modes integrate every section with its second moment, whatever the particles
-        log.info(f"on a grid: {section.described(world.dx)}")
-        return section
-    log.metric("held_section_cells", section.cells(world.dx))
-    if section.cells(world.dx) < 0.99 * COARSE:  # a section of two cells is two, whatever the rounding
-        log.warn(f"{section.described(world.dx)}; take scene.dx <= {section.thickness / COARSE:.2g} m for better")
-    else:
-        log.info(section.described(world.dx))
+    if world.solver == "grid":  # modes integrate every section with its second moment, whatever the particles
+        say_resolution(section, world.dx, log)
     return section
+
+
+def say_resolution(section: Section | None, dx: float, log: Log) -> None:
+    """How well a grid of cells `dx` [m] resolves the thinnest held section, and the remedy where it does not."""
+    if section is None:
+        return
+    log.metric("held_section_cells", section.cells(dx))
+    if section.cells(dx) < 0.99 * COARSE:  # a section of two cells is two, whatever the rounding
+        log.warn(f"{section.described(dx)}; take scene.dx <= {section.thickness / COARSE:.2g} m for better")
+    else:
+        log.info(section.described(dx))
 
 
 def _named(boundary: AbstractBoundary) -> str:

@@ -106,6 +106,7 @@ def chain_of(
         prior=prior,
         estimator=estimator,
         pushed=pushed if forced else None,
+        on_grid=motion.modes is None,
         journal=Journal(log),
     )
 

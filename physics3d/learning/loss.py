@@ -41,6 +41,7 @@ class Chain:
     estimator: AbstractEstimator = field(default_factory=ScoreDistillation)
     # theta [k], ln of a factor on every known force -> trajectory; None: no force is known that drives the motion
     pushed: Callable[[Tensor, float], Any] | None = None
+    on_grid: bool = True  # whether a grid moves the body, whose resolution a stiffness then hangs on
     journal: Journal = field(default_factory=lambda: Journal(Log(None)))
 
     @cached_property

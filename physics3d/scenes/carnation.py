@@ -5,8 +5,9 @@ What deforms is one viscoelastic solid: stem, calyx and the dome that the petals
 and leaves are thin sheets without mass, carried by it. The stem is kept thick so that cells of 1.2 cm resolve
 its bending. The photographed shape is the rest shape, so there is no gravity.
 
-The motion is computed by the project's own solver, but with a finer grid, other particles and other time steps than the
-pipeline takes, and the pictures are ray traced from meshes: learning has to see through both differences.
+The motion is that of finite elements by a library (`finite_elements.py`), kept in a file (`reference_motion.py`); where
+a number of the twin is changed it is computed by the project's own grid, finer than the pipeline's. The pictures are
+ray traced from meshes.
 """
 
 from dataclasses import dataclass
@@ -33,7 +34,8 @@ from physics3d.scenes import room
 from physics3d.scenes.base import AbstractSource, Capture, Outline
 from physics3d.scenes.flower import SOIL, blossom_centre, plant, surroundings
 from physics3d.scenes.photographs import triple
-from physics3d.scenes.studio import Studio
+from physics3d.scenes.reference_motion import Pokes, path_of
+from physics3d.scenes.studio import Mesh, Studio
 from physics3d.scenes.synthetic import captured, outlined, particles
 from physics3d.world import World
 
@@ -60,13 +62,14 @@ class CarnationTwin(AbstractSource):
     shear_relaxation_time: Duration = 0.15  # 1/k_d [s]
     bulk_relaxation_time: Duration = 0.15  # 1/k_v [s]
     density: Positive = 300.0  # petals hold much air [kg/m^3]
-    # how the reference motion is computed: finer than the pipeline
+    # how the motion is computed where none is kept: finer than the pipeline
     dx: Length = 0.010  # cell of the grid [m]
     seed: Seed = 0
     device: Device = "cpu"
 
     def files(self) -> tuple[str, ...]:
-        return ()
+        kept = path_of("carnation", self.seed)
+        return (str(kept),) if kept.exists() else ()
 
     @property
     def outline(self) -> Outline:
@@ -76,16 +79,12 @@ class CarnationTwin(AbstractSource):
         require_fields(self, "source")
         meshes, solids = plant(self.seed)
         studio = Studio([*meshes, *surroundings(self.seed)], room.DAYLIGHT, openness_rays=24, seed=self.seed)
-        centre = blossom_centre()
-        pokes = {
-            role: (Impulse(force=triple("force", force), centre=centre, radius=0.05, start=0.0, duration=self.push),)
-            for role, force in (("learn", self.learn_force), ("evaluate", self.evaluate_force))
-        }
         return captured(
             name="carnation",
             world=self.world(),
-            pokes=pokes,
+            pokes=self.pokes(),
             matter=particles(solids, self.dx / 2, self.seed),
+            solids=solids,
             studio=studio,
             cameras=photographers(self.views, self.width, self.height),
             witness=room.witness(self.width, self.height, target=TARGET, distance=DISTANCE, opening=OPENING),
@@ -101,6 +100,18 @@ class CarnationTwin(AbstractSource):
             ),
             log=log,
         )
+
+    def solids(self) -> list[Mesh]:
+        """What deforms, as closed meshes."""
+        return plant(self.seed)[1]
+
+    def pokes(self) -> Pokes:
+        """The push of each take, by its role."""
+        centre = blossom_centre()
+        return {
+            role: (Impulse(force=triple("force", force), centre=centre, radius=0.05, start=0.0, duration=self.push),)
+            for role, force in (("learn", self.learn_force), ("evaluate", self.evaluate_force))
+        }
 
     def world(self) -> World:
         """The physics that the reference motion obeys, with the true parameters as start."""

@@ -5,8 +5,9 @@
     world      the truth: material, parameters, what holds the thing, and a grid finer than the pipeline's
     learn      what sets the thing going in the take to learn from, evaluate: in the one that is held out
 
-It stands on a table before a wall. The motion is computed by the project's own solver, with other particles and cells
-than the pipeline takes, and the pictures are ray traced from meshes: learning has to see through both differences.
+It stands on a table before a wall. The motion is that of finite elements where one is kept (`reference_motion.py`),
+else it is computed by the project's own grid, with other particles and cells than the pipeline takes; the pictures are
+ray traced from meshes: learning has to see through both differences.
 """
 
 from collections.abc import Mapping
@@ -31,6 +32,7 @@ from physics3d.checks import (
     require_fields,
 )
 from physics3d.scenes.base import AbstractSource, Capture, Outline
+from physics3d.scenes.reference_motion import Pokes, path_of
 from physics3d.scenes.room import DAYLIGHT, photographers, room, witness
 from physics3d.scenes.shapes import AbstractShape, Place, Sheet
 from physics3d.scenes.studio import Mesh, Studio
@@ -69,7 +71,8 @@ class MadeTwin(AbstractSource):
             raise ValueError("source.moving has no shape that is full; nothing would move, make one of them full")
 
     def files(self) -> tuple[str, ...]:
-        return ()
+        kept = path_of(self.name, self.seed)
+        return (str(kept),) if kept.exists() else ()
 
     @property
     def outline(self) -> Outline:
@@ -81,8 +84,9 @@ class MadeTwin(AbstractSource):
         return captured(
             name=self.name,
             world=self.world,
-            pokes={"learn": self.learn, "evaluate": self.evaluate},
+            pokes=self.pokes(),
             matter=self.matter(),
+            solids=self.solids(),
             studio=Studio([*self.meshes(), *room()], DAYLIGHT, openness_rays=24, seed=self.seed),
             cameras=photographers(self.views, self.width, self.height, **seen),
             witness=witness(self.width, self.height, **seen),
@@ -100,6 +104,14 @@ class MadeTwin(AbstractSource):
         """All that is seen of the thing and of what stands around it, in the order of the scene's file."""
         named = [(shape, True) for shape in self.moving.values()] + [(shape, False) for shape in self.still.values()]
         return [m for i, (shape, moves) in enumerate(named) for m in shape.meshes(self.seed + i, moves=moves)]
+
+    def pokes(self) -> Pokes:
+        """The push of each take, by its role."""
+        return {"learn": self.learn, "evaluate": self.evaluate}
+
+    def solids(self) -> list[Mesh]:
+        """What deforms, as closed meshes; sheets that are thinner than two particles are in as well."""
+        return [m for shape in self.moving.values() if shape.full for m in shape.meshes(self.seed, moves=True)]
 
     def matter(self) -> tuple[Float32[np.ndarray, "p 3"], Float32[np.ndarray, " p"]]:
         """Particles of the body, half a cell apart: position [m], volume [m^3]. What overlaps counts once."""

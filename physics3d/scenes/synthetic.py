@@ -7,7 +7,7 @@ Solids are sampled with particles of their own, and vertices follow the particle
 which is exact for affine motion.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -21,6 +21,7 @@ from physics3d.mpm.rollout import rollout
 from physics3d.open3d_import import open3d
 from physics3d.scenes.base import Capture, Footage, Outline, Take
 from physics3d.scenes.photographs import held_out
+from physics3d.scenes.reference_motion import Moved, path_of, recorded
 from physics3d.scenes.studio import Mesh, Studio, photographs
 from physics3d.world import World
 
@@ -42,6 +43,7 @@ def captured(
     world: World,
     pokes: Mapping[str, tuple[AbstractBoundary, ...]],
     matter: tuple[Float32[np.ndarray, "p 3"], Float32[np.ndarray, " p"]],
+    solids: Sequence[Mesh] = (),
     studio: Studio,
     cameras: list[Camera],
     witness: Camera,
@@ -58,11 +60,15 @@ def captured(
 ) -> Capture:
     """A twin, photographed by `cameras` at rest and filmed by `witness` once for each role in `pokes`.
 
-    `matter` is position [m] and volume [m^3] of the particles; there are `points` surface points, `noise` [m] off
-    along each axis.
+    `matter` is position [m] and volume [m^3] of the particles, by which the grid moves the body where no reference
+    motion of these `solids` is kept (`reference_motion.py`); there are `points` surface points, `noise` [m] off along
+    each axis.
     """
     images, alphas, found, colors = photographs(studio.pose(), cameras, points=points, noise=noise, seed=seed, log=log)
     position, volume = matter
+    kept = recorded(path_of(name, seed), world, pokes, solids, frames=frames, fps=fps)
+    by = f"the grid, cells of {1e3 * world.dx:.2g} mm" if kept is None else kept[1]
+    log.info(f"reference motion: {by}")
     takes = [
         film(
             role=role,
@@ -70,6 +76,7 @@ def captured(
             excitation=excitation,
             position=position,
             volume=volume,
+            known=None if kept is None else kept[0][role],
             studio=studio,
             cameras=[witness],
             frames=frames,
@@ -93,7 +100,7 @@ def captured(
         single_object=single_object,
         floor=0.0,
         truth=world.start,
-        truth_source="set in the code that made this twin",
+        truth_source=f"set in the code that made this twin; its motion by {by}",
         note=note,
     )
     capture.check()
@@ -107,6 +114,7 @@ def film(
     excitation: tuple[AbstractBoundary, ...],
     position: Float32[np.ndarray, "p 3"],
     volume: Float32[np.ndarray, " p"],
+    known: Moved | None,
     studio: Studio,
     cameras: list[Camera],
     frames: int,
@@ -114,7 +122,40 @@ def film(
     device: str,
     log,
 ) -> Take:
-    """Simulate the particles with the parameters `world.start`, and photograph the meshes that follow them."""
+    """Photograph the meshes as they follow the motion that is `known`, or else that of the particles, simulated with
+    the parameters `world.start`."""
+    moved = known or _by_grid(world, excitation, position, volume, frames=frames, fps=fps, device=device, log=log)
+    carrier = Carrier(studio.rest(), studio.anchors(), moved.place, world.dx)
+    videos: list[list[Tensor]] = [[] for _ in cameras]
+    furthest = 0.0
+    for t in log.progress(range(frames), f"filming the take to {role}"):
+        vertices = carrier(moved.position[t], moved.deformation[t])
+        furthest = max(furthest, float(np.linalg.norm(vertices - studio.rest(), axis=1).max()))
+        pose = studio.pose(vertices)
+        for camera, video in zip(cameras, videos):
+            video.append(pose.photograph(camera)[0])
+    log.info(f"take to {role}: moves by up to {1e3 * furthest:.0f} mm")
+    return Take(
+        name=role,
+        role=role,
+        fps=fps,
+        cameras=tuple(cameras),
+        videos=tuple(torch.stack(v) for v in videos),
+        excitation=excitation,
+    )
+
+
+def _by_grid(
+    world: World,
+    excitation: tuple[AbstractBoundary, ...],
+    position: Float32[np.ndarray, "p 3"],
+    volume: Float32[np.ndarray, " p"],
+    *,
+    frames: int,
+    fps: float,
+    device: str,
+    log,
+) -> Moved:
     trajectory = rollout(
         world,
         world.estimate().parameters,
@@ -127,27 +168,12 @@ def film(
         log=log,
     )
     trajectory.check()
-    carrier = Carrier(studio.rest(), studio.anchors(), position, world.dx)
-    videos: list[list[Tensor]] = [[] for _ in cameras]
-    furthest = 0.0
-    for t in log.progress(range(frames), f"filming the take to {role}"):
-        moved = carrier(trajectory.position[t].cpu().numpy(), trajectory.deformation[t].cpu().numpy())
-        furthest = max(furthest, float(np.linalg.norm(moved - studio.rest(), axis=1).max()))
-        pose = studio.pose(moved)
-        for camera, video in zip(cameras, videos):
-            video.append(pose.photograph(camera)[0])
     log.info(
-        f"take to {role}: {len(position)} particles, {1e6 * volume.sum():.0f} cm^3, cells of {1e3 * world.dx:.2g} mm, "
-        f"substeps of {trajectory.substep_dt:.2g} s, moves by up to {1e3 * furthest:.0f} mm"
+        f"{len(position)} particles, {1e6 * volume.sum():.0f} cm^3, cells of {1e3 * world.dx:.2g} mm, substeps of "
+        f"{trajectory.substep_dt:.2g} s"
     )
-    return Take(
-        name=role,
-        role=role,
-        fps=fps,
-        cameras=tuple(cameras),
-        videos=tuple(torch.stack(v) for v in videos),
-        excitation=excitation,
-    )
+    x, F = (a.cpu().numpy() for a in (trajectory.position, trajectory.deformation))
+    return Moved(place=position, position=x, deformation=F)
 
 
 def particles(

@@ -1,0 +1,66 @@
+"""make reference-motion SCENE=carnation [ARGS="scene.source.seed=1"]: how a twin moves by finite elements.
+
+    python -m pipeline.reference_motion scene=carnation [words of the configuration] [edge=0.010] [steps=6]
+
+`edge` is the length of the tetrahedra's edges [m], `steps` the time steps to a frame. Writes the file that the twin
+reads from then on (`physics3d/scenes/reference_motion.py`), and says its frequencies. Needs `pip install pytetwild
+pyvista`. Exit codes: 0 done, 1 it cannot be done, 2 a word means nothing, 130 Ctrl-C.
+"""
+
+import importlib.util
+import sys
+
+from pipeline.filed import megabytes, one_line
+from pipeline.settings import SettingsError, compose
+
+EDGE, STEPS = 0.010, 6
+
+
+def main(words: list[str]) -> int:
+    return one_line(lambda: write(words), lambda text: print(text, file=sys.stderr))
+
+
+def write(words: list[str]) -> None:
+    """Raises SettingsError, and ValueError where the scene is no twin that finite elements are made for."""
+    own = dict(w.split("=", 1) for w in words if w.startswith(("edge=", "steps=")))
+    try:
+        edge, steps = float(own.get("edge", EDGE)), int(own.get("steps", STEPS))
+    except ValueError:
+        raise SettingsError(f"{own}: edge is a length in m, steps a whole number") from None
+    settings, _ = compose([w for w in words if not w.startswith(("edge=", "steps="))])
+    if any(importlib.util.find_spec(name) is None for name in ("pytetwild", "pyvista")):
+        raise ValueError("the mesher is missing; pip install pytetwild pyvista")
+
+    from hydra.utils import instantiate
+
+    from physics3d.log import Log
+    from physics3d.scenes import finite_elements, reference_motion
+    from physics3d.scenes.carnation import CarnationTwin
+    from physics3d.scenes.made import MadeTwin
+    from physics3d.scenes.synthetic import particles
+
+    source = instantiate(settings["scene"]["source"])
+    if not isinstance(source, CarnationTwin | MadeTwin):
+        raise ValueError(f"scene.source is a {type(source).__name__}; finite elements are made for twins that are held")
+    world = source.world if isinstance(source, MadeTwin) else source.world()
+    name = source.name if isinstance(source, MadeTwin) else "carnation"
+    solids, log = source.solids(), Log(None)
+    body = finite_elements.meshed(solids, world, edge)
+    print(f"mesh      {body.gradient.shape[1]} nodes, {1e6 * body.weight.sum():.1f} cm^3", flush=True)
+    found = finite_elements.frequencies(body, world, 4)
+    print(f"stuck     {', '.join(f'{f:.4g}' for f in found)} Hz", flush=True)
+    place, _ = particles(solids, world.dx / 2, source.seed)
+    moved = {}
+    for role, push in source.pokes().items():
+        films = finite_elements.swing(body, world, push, frames=source.frames, fps=source.fps, steps=steps, log=log)
+        position, deformation = finite_elements.carried(body, films, place)
+        moved[role] = reference_motion.Moved(place=place, position=position, deformation=deformation)
+        print(f"moved     {role}: by up to {1e3 * abs(position - place).max():.1f} mm", flush=True)
+    made = f"finite elements: scikit-fem, {body.gradient.shape[1]} nodes of quadratic tetrahedra, {steps} steps a frame"
+    path = reference_motion.path_of(name, source.seed)
+    error = reference_motion.save(path, world, source.pokes(), solids, source.fps, moved, made)
+    print(f"written   {path}   {megabytes(path.stat().st_size)}, positions to {1e6 * error:.0f} micrometres")
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,142 @@
+"""Finite elements that move a twin: beams in closed form; and the file that keeps their answer."""
+
+import math
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from skfem import MeshTet
+
+from physics3d.boundaries.fixed_region import FixedRegion
+from physics3d.boundaries.impulse import Impulse
+from physics3d.log import Log
+from physics3d.materials.viscoelastic import Viscoelastic
+from physics3d.scenes import finite_elements, reference_motion
+from physics3d.scenes.carnation import CarnationTwin
+from physics3d.world import World
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "modes"))
+from modes_bodies import section, timoshenko
+
+YOUNG, POISSON, DENSITY = 1.5e5, 0.3, 300.0
+THICK, LENGTH = 0.012, 0.12  # of a beam that stands on z = 0 [m]
+CLAMP = FixedRegion(lower=(-1.0, -1.0, -1.0), upper=(1.0, 1.0, 0.0))
+TIP = (0.0, 0.0, LENGTH)
+
+
+def beam() -> finite_elements.Body:
+    across, along = np.linspace(-THICK / 2, THICK / 2, 3), np.linspace(0, LENGTH, 25)
+    return finite_elements.on(MeshTet.init_tensor(across, across, along), 1e-9)
+
+
+def world(branch: float, relaxation: float) -> World:
+    """A body whose branch is `branch` times as stiff as its elastic spring."""
+    mu, K = YOUNG / (2 * (1 + POISSON)), YOUNG / (3 * (1 - 2 * POISSON))
+    start = dict(
+        youngs_modulus=YOUNG, poissons_ratio=POISSON, branch_shear_modulus=branch * mu, branch_bulk_modulus=branch * K,
+        shear_relaxation_time=relaxation, bulk_relaxation_time=relaxation,
+    )  # fmt: skip
+    return World(
+        material=Viscoelastic(), density=DENSITY, start=start, dx=0.01, gravity=(0.0, 0.0, 0.0), boundaries=(CLAMP,)
+    )
+
+
+def first(young: float) -> float:
+    """Hz, by Timoshenko."""
+    area, inertia, shear = section("square", THICK, POISSON)
+    return timoshenko(LENGTH, area, inertia, young, POISSON, DENSITY, shear, free=False)[0]
+
+
+def test_a_clamped_beam_has_the_frequencies_of_timoshenko():
+    """The clamp also hinders the section from widening, which the beam does not know: 0.7 per cent. A stuck branch adds
+    its own stiffness."""
+    for branch in (1e-9, 0.5):
+        found = finite_elements.frequencies(beam(), world(branch, 0.1), 2)
+        expected = first((1 + branch) * YOUNG)
+        assert found == pytest.approx([expected, expected], rel=0.01)
+
+
+def test_a_beam_that_was_pushed_swings_as_an_oscillator_with_a_branch():
+    """The first mode is x'' + w^2 x + g^2 int x' exp(-(t-s)/tau) ds = f, w and g those of spring and branch alone: here
+    integrated to round-off. The second mode is 6.3 times as
+    fast, so that a force on the tip moves it by 1/39 as much, and by twice that where it overshoots."""
+    from scipy.integrate import solve_ivp
+
+    branch, tau, frames, fps, duration = 0.5, 0.1, 24, 40.0, 0.1
+    body = beam()
+    push = Impulse(force=(2e-4, 0.0, 0.0), centre=TIP, radius=0.02, duration=duration)
+    films = finite_elements.swing(body, world(branch, tau), (push,), frames=frames, fps=fps, steps=6, log=Log(None))
+    tip = np.argmin(np.linalg.norm(body.basis.doflocs.T - np.array(TIP), axis=1))
+    moved = films[:, tip, 0]
+    w2 = (2 * math.pi * first(YOUNG)) ** 2
+
+    def rates(t, y):  # displacement, speed, stretch of the branch's spring
+        return [y[1], (t < duration) - w2 * (y[0] + branch * y[2]), y[1] - y[2] / tau]
+
+    time = np.arange(frames) / fps
+    exact = solve_ivp(rates, (0, time[-1]), [0, 0, 0], t_eval=time, max_step=1e-3, rtol=1e-8).y[0]
+    scale = (moved @ exact) / (exact @ exact)
+    assert scale > 0 and np.abs(moved - scale * exact).max() < 0.06 * np.abs(moved).max()
+
+
+def test_what_lies_in_the_tetrahedra_is_carried_by_them():
+    """A field that is quadratic is that of the elements themselves, and so is its gradient."""
+    body = beam()
+    X = body.basis.doflocs.T
+    field = lambda x: np.stack([x[:, 0] * x[:, 2], x[:, 1] ** 2, x[:, 0] - x[:, 2] ** 2], 1)
+    place = np.random.default_rng(0).uniform((-0.005, -0.005, 0.001), (0.005, 0.005, 0.119), (50, 3))
+    x, F = finite_elements.carried(body, field(X)[None], place)
+    a, b, c = place.T
+    zero = 0 * a
+    slope = np.stack(
+        [np.stack([c, zero, a], 1), np.stack([zero, 2 * b, zero], 1), np.stack([1 + zero, zero, -2 * c], 1)], 1
+    )
+    np.testing.assert_allclose(x[0], place + field(place), atol=1e-12)
+    np.testing.assert_allclose(F[0], np.eye(3) + slope, atol=1e-9)
+
+
+@pytest.mark.parametrize("kept", sorted(reference_motion.FOLDER.glob("carnation_*.npz")), ids=lambda path: path.stem)
+def test_a_motion_that_is_kept_is_that_of_the_twin_as_it_is_and_of_no_other(kept):
+    twin = CarnationTwin(seed=int(kept.stem.split("_")[1]))
+    asked = dict(frames=twin.frames, fps=twin.fps)
+    found = reference_motion.recorded(kept, twin.world(), twin.pokes(), twin.solids(), **asked)
+    assert found is not None, "the twin has changed since; make reference-motion"
+    moved, made = found
+    assert "finite elements" in made
+    for take in moved.values():
+        still = take.place[:, 2] < 0.072 - 1e-6
+        np.testing.assert_array_equal(take.position[0], take.place)
+        assert np.abs(take.position - take.place)[:, still].max() < 2e-5  # of half precision
+        assert np.abs(take.position - take.place).max() > 0.01
+        assert np.linalg.det(take.deformation).min() > 0.5
+    stiffer = replace(twin, youngs_modulus=1.6e5)
+    pushed = replace(twin, learn_force=(0.1, 0.0, 0.0))
+    other = CarnationTwin(seed=twin.seed + 7)
+    for strange in (stiffer, pushed, other):
+        assert reference_motion.recorded(kept, strange.world(), strange.pokes(), strange.solids(), **asked) is None
+    for timing in (dict(frames=twin.frames + 1, fps=twin.fps), dict(frames=5, fps=0.7 * twin.fps)):
+        assert reference_motion.recorded(kept, twin.world(), twin.pokes(), twin.solids(), **timing) is None
+
+
+def test_what_was_kept_comes_back(tmp_path):
+    rng = np.random.default_rng(0)
+    twin = CarnationTwin()
+    place, t = rng.uniform(0, 0.1, (40, 3)).astype(np.float32), np.arange(9)
+    shapes, slopes = rng.normal(size=(3, 40, 3)), rng.normal(size=(3, 40, 3, 3))
+    amplitude = 0.01 * np.stack([np.sin((k + 1) * t) for k in range(3)], 1)
+    moved = reference_motion.Moved(
+        place=place,
+        position=place + np.einsum("tk,kpi->tpi", amplitude, shapes),
+        deformation=np.eye(3) + np.einsum("tk,kpij->tpij", amplitude, slopes),
+    )
+    path = tmp_path / "thing.npz"
+    asked = (twin.world(), {"learn": twin.pokes()["learn"]}, twin.solids())
+    reference_motion.save(path, *asked, 30.0, {"learn": moved}, "by hand")
+    found = reference_motion.recorded(path, *asked, frames=5, fps=15.0)
+    assert found is not None
+    again = found[0]["learn"]
+    # half precision of three fields of up to 3 cm
+    np.testing.assert_allclose(again.position, moved.position[::2], atol=1e-4)
+    np.testing.assert_allclose(again.deformation, moved.deformation[::2], atol=1e-2)
