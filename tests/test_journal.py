@@ -10,7 +10,7 @@ from physics3d.log import Log
 
 
 def test_an_optimiser_of_scipy_goes_on_where_it_was(tmp_path, monkeypatch):
-    """Rosenbrock's valley by Powell: however often it is stopped, no place is looked at twice, and it ends at the same one.
+    """Rosenbrock's valley by Powell: however often it is stopped, no place is looked at twice; it ends at the same one.
 
     One round along all directions has every kind of question; each note waits for the disk, so a few dozen are enough.
     """
