@@ -134,18 +134,18 @@ def start(config: dict, env: dict[str, str], *words: str) -> subprocess.Popen:
     return subprocess.Popen(call, stdout=pipe, stderr=pipe, text=True, env=env, cwd=ROOT, start_new_session=True)
 
 
-def test_a_run_its_record_and_the_run_after_it(folder, prefect):
-    config = configuration(folder)
+def test_a_run_its_record_and_the_run_after_it(tmp_path, prefect):
+    config = configuration(tmp_path)
     process = start(config, prefect)
     out, err = process.communicate()
     assert process.returncode == 0, out + err
-    assert "computed" in out and "reused" not in out and address(folder) in out
+    assert "computed" in out and "reused" not in out and address(tmp_path) in out
     table = [line.split() for line in out.splitlines()]
     # start, learned, no interval, truth
     assert ["youngs_modulus", "1", "1.5", "no", "interval", "is", "known", "2"] in table
     assert ["learned", "11", "-"] in table, out  # every stage added its 1 to what it was given
 
-    with sqlite3.connect(folder / "mlflow.db") as record:
+    with sqlite3.connect(tmp_path / "mlflow.db") as record:
         runs = dict(record.execute("select run_uuid, status from runs").fetchall())
         assert set(runs.values()) == {"FINISHED"} and len(runs) == 1 + len(ALL)
         tags = set(record.execute("select key, value from tags where key in ('stage', 'cache', 'scene')").fetchall())
@@ -157,8 +157,8 @@ def test_a_run_its_record_and_the_run_after_it(folder, prefect):
         (experiment,) = record.execute(
             "select artifact_location from experiments where name=?", (EXPERIMENT,)
         ).fetchone()
-        assert experiment == (folder / "mlartifacts").as_uri()
-    assert list((folder / "mlartifacts").rglob("*.png")), "previews belong to the record"
+        assert experiment == (tmp_path / "mlartifacts").as_uri()
+    assert list((tmp_path / "mlartifacts").rglob("*.png")), "previews belong to the record"
 
     again, _ = start(config, prefect, "light").communicate()
     assert (
@@ -168,7 +168,7 @@ def test_a_run_its_record_and_the_run_after_it(folder, prefect):
     )
     assert "imported: []" in again  # that is what makes it quick
 
-    more, _ = start(configuration(folder, learn={"modulus": 1.7}), prefect).communicate()
+    more, _ = start(configuration(tmp_path, learn={"modulus": 1.7}), prefect).communicate()
     assert more.count("computed") == 4 and more.count("reused") == 7  # learn, simulate, render, evaluate
 
 
@@ -206,9 +206,9 @@ def test_interrupt_ends_with_130_and_keeps_what_is_finished(folder, prefect, nam
     assert len(list((folder / "artifacts" / "fill").iterdir())) == 1
 
 
-def test_a_broken_record_does_not_lose_the_result(folder, prefect):
-    (folder / "mlartifacts").write_text("where MLflow wants a folder")
-    process = start(configuration(folder), prefect)
+def test_a_broken_record_does_not_lose_the_result(tmp_path, prefect):
+    (tmp_path / "mlartifacts").write_text("where MLflow wants a folder")
+    process = start(configuration(tmp_path), prefect)
     out, err = process.communicate()
     assert process.returncode == 0, err
     assert out.count("not recorded in MLflow, the results are unharmed") == 1
