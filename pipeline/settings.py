@@ -36,9 +36,9 @@ def compose(words: list[str]) -> tuple[dict[str, Any], dict[str, str]]:
     GlobalHydra.instance().clear()
     with initialize_config_dir(str(CONF), version_base="1.3"):
         groups = [w for w in words if w.split("=")[0] in GROUPS]
-        base = compose("config", groups)
-        known = cast(dict[str, Any], OmegaConf.to_container(base, resolve=False))
-        words = [w if w in groups else _known_or_new(w, known) for w in words]
+        if len(groups) < len(words):  # what the other words may name depends on what the groups bring
+            known = cast(dict[str, Any], OmegaConf.to_container(compose("config", groups), resolve=False))
+            words = [w if w in groups else _known_or_new(w, known) for w in words]
         try:
             config = compose("config", words, return_hydra_config=True)
             picked = {g: config.hydra.runtime.choices[g] for g in GROUPS if g in config.hydra.runtime.choices}
@@ -65,9 +65,12 @@ def _of_the_material(config: Any, picked: dict[str, str], words: list[str]) -> N
     a branch, say, under METHOD=without_viscoelastic. What is on the command line stays, and is refused."""
     from omegaconf import OmegaConf
 
-    names = {kind: set(OmegaConf.load(CONF / "material" / f"{kind}.yaml").start) for kind in choices("material")}
-    known, said = set().union(*names.values()), {word.partition("=")[0] for word in words}
-    for name in set(config.material.start) & known - names[picked["material"]]:
+    starts = lambda kind: set(OmegaConf.load(CONF / "material" / f"{kind}.yaml").start)
+    others = set(config.material.start) - starts(picked["material"])
+    said = {word.partition("=")[0] for word in words}
+    if not others:
+        return  # as a rule: the files of all the other materials need not be read
+    for name in others & set().union(*map(starts, choices("material"))):
         if f"material.start.{name}" not in said:
             del config.material.start[name]
 

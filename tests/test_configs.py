@@ -304,6 +304,12 @@ def composed(words: tuple[str, ...]) -> tuple[dict, dict]:
     return config, {key: paths for key, paths in reached.items() if any(p[0] in taken for p in paths)}
 
 
+def put(tree: Any, path: tuple, value: Any) -> None:
+    for name in path[:-1]:
+        tree = tree[name]
+    tree[path[-1]] = value
+
+
 def alike(key: str) -> str:
     """The same for all points of a list, and for all shapes of a thing that is made of them."""
     return re.sub(
@@ -322,7 +328,7 @@ SETTINGS += [(f"profile={n}",) for n in choices("profile")] + [(f"method={n}",) 
 @pytest.mark.parametrize("words", SETTINGS, ids=" ".join)
 def test_every_number_and_name_that_cannot_be_is_refused_in_one_line(words):
     """Every leaf of the page, every bad value; those of a scene, prior, ... only where these are not the usual ones."""
-    config, reached = composed(words)
+    config, reached = deepcopy(composed(words))
     usual, own = dict(leaves(composed(())[0])) if words else {}, dict(leaves(config))
     tried = 0
     kinds = {alike(key): key for key in reversed(reached)}  # the first of each kind
@@ -333,13 +339,11 @@ def test_every_number_and_name_that_cannot_be_is_refused_in_one_line(words):
             continue
         for new in BAD:
             expected = legal(key, old, new)
-            changed = deepcopy(config)
             for path in paths:
-                node = changed
-                for name in path[:-1]:
-                    node = node[name]
-                node[path[-1]] = new
-            text = problem(changed, {})
+                put(config, path, new)
+            text = problem(config, {})
+            for path in paths:
+                put(config, path, old)
             tried += 1
             if expected is not None:
                 assert (text is None) == expected, f"{key}={new}: {text}"
@@ -347,6 +351,7 @@ def test_every_number_and_name_that_cannot_be_is_refused_in_one_line(words):
                 assert "\n" not in text and "; " in text and ("take" in text or "needs" in text or "give" in text), text
                 assert any(str(name) in text for name in paths[0][-3:]), (key, text)
     assert tried > 500 or words
+    assert config == composed(words)[0], "every value was put back"
 
 
 @pytest.mark.parametrize("stage", STAGES)
