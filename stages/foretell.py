@@ -18,7 +18,7 @@ from torch import Tensor
 from physics3d.checks import Duration, require_fields
 from physics3d.filling.body import Body
 from physics3d.gaussians.model import Gaussians
-from physics3d.learning.foretold import Moving, foretold
+from physics3d.learning.foretold import Moving, foretold, has_stopped
 from physics3d.learning.free_body import material_of
 from physics3d.learning.free_motion import Material, start
 from physics3d.learning.identify import Swing, another_take, identified
@@ -51,7 +51,7 @@ class Foretell:
         """Rows are "take: prediction". Raises ValueError as `swung` does."""
         require_fields(self, "foretell")
         ready = swung(self.world, capture, gaussians, body, zones=self.zones, log=log)
-        clip, flow, _, decay, release = first_take(ready, log)
+        clip, flow, trusted, decay, release = first_take(ready, log)
         learned = material_of(self.world, estimate, ready.reduced.zone)
         before = material_of(self.world, self.world.estimate(), ready.reduced.zone)
         take, posed = ready.take, ready.take.posed
@@ -69,6 +69,8 @@ class Foretell:
         for name, material in ((LEARNED, learned), (START, before)):
             motions[name] = start(ready.reduced, material, window, reference=reference)[0]
         pose = {name: None if reference is None else motion.at(reference) for name, motion in motions.items()}
+        if has_stopped(ready.sight, swing, flow, trusted, fps=take.fps, release=release):
+            motions[SEEN] = _stopped(swing, take, notes, log)
         scores |= self.judged(ready, take, motions, flow[-1], release=release, seen=seen, notes=notes, log=log)
         for other in capture.takes:
             if other is not take:
@@ -100,10 +102,13 @@ class Foretell:
         if seen - release < 4:
             notes[take.name] = f"{len(frames)} frames, free from {release} on, are too few to be foretold"
             return {}
-        clip, flow, _ = observe(ready.sight, frames[:seen], take.fps, reference=ready.picture)
+        clip, flow, trusted = observe(ready.sight, frames[:seen], take.fps, reference=ready.picture)
         window = clip.window(release, seen)
         known = {name: None if take.at_rest else place for name, place in pose.items()}
-        motions: dict[str, Moving] = {SEEN: another_take(ready.reduced, window, first.modes, known[SEEN])}
+        swing = another_take(ready.reduced, window, first.modes, known[SEEN])
+        if has_stopped(ready.sight, swing, flow, trusted, fps=take.fps, release=release):
+            swing = _stopped(swing, take, notes, log)
+        motions: dict[str, Moving] = {SEEN: swing}
         for name, material in materials.items():
             motions[name] = start(ready.reduced, material, window, known=known[name])[0]
         return self.judged(ready, take, motions, flow[-1], release=release, seen=seen, notes=notes, log=log)
@@ -152,6 +157,13 @@ class Foretell:
         log.image(f"{take.name}_curves", curves(lines, take.fps, first=seen))
         shown = ["recorded", SEEN, IMAGE]
         log.image(f"{take.name}_slices", slices(shown, [future, clips[SEEN], clips[IMAGE]], *busiest(future)))
+
+
+def _stopped(swing: Swing, take: Take, notes: dict[str, str], log: Log) -> Swing:
+    why = "the thing has come to rest in what was seen: the last frame of it is foretold"
+    notes[f"{take.name}: {SEEN}"] = why
+    log.info(f"{take.name}: {why}")
+    return swing.stopped()
 
 
 def _plain(cells, name: str, notes: dict[str, str]) -> dict[str, float | None]:
