@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-import torch
 from annotated_types import Ge, Le
 from torch import Tensor
 
@@ -26,14 +25,11 @@ from physics3d.learning.seen_modes import observe
 from physics3d.learning.unknown_cause import Swung, by_its_own_camera, first_take, frames_seen, swung
 from physics3d.log import Log
 from physics3d.metrics.against import Reference
-from physics3d.metrics.image import psnr_per_frame, ssim_per_frame
-from physics3d.metrics.pictures import busiest, curves, slices
 from physics3d.metrics.scores import REFERENCE, Scores
+from physics3d.metrics.take_page import take_page
 from physics3d.motion.image_modes import image_modes
 from physics3d.motion.stills import stills
-from physics3d.pictures import contact_sheet
 from physics3d.scenes.base import Capture, Take
-from physics3d.video import write_mp4
 from physics3d.world import Estimate, World
 
 SEEN, LEARNED, START, IMAGE = "modes as seen", "learned material", "material before", "image modes"
@@ -125,11 +121,13 @@ class Foretell:
         notes: dict[str, str],
         log: Log,
     ) -> dict[str, dict[str, float | None]]:
-        """Measures and pictures of what follows frame `seen` - 1."""
+        """Measures and the page of what follows frame `seen` - 1."""
         frames, fps = take.videos[0], take.fps
         future = frames[seen:]
         times = (np.arange(seen, len(frames)) - release) / fps
         last = (seen - 1 - release) / fps
+        swing = motions[SEEN]
+        assert isinstance(swing, Swing)
         clips: dict[str, Tensor] = {
             name: foretold(frames[seen - 1], ready.sight, motion, moved, last=last, times=times)
             for name, motion in motions.items()
@@ -137,26 +135,14 @@ class Foretell:
         clips[IMAGE] = image_modes(frames[:seen], fps).frames(range(seen, len(frames)))
         clips |= stills(frames, seen=seen)
         measured = Reference(future, fps)
-        rows = {f"{take.name}: {REFERENCE}": _plain(measured.itself()[0], take.name, notes)}
+        found = {REFERENCE: _plain(measured.itself()[0], take.name, notes)}
         for name, clip in log.progress(list(clips.items()), f"scoring {take.name}"):
-            rows[f"{take.name}: {name}"] = _plain(measured.measure(clip)[0], take.name, notes)
-        self.pictures(take, clips, seen, log)
-        return rows
-
-    def pictures(self, take: Take, clips: dict[str, Tensor], seen: int, log: Log) -> None:
-        """A film of the take beside what was foretold, curves over the frames, and space-time slices."""
-        if log.folder is None:
-            return
-        future = take.videos[0][seen:]
-        write_mp4(log.path(f"{take.name}.mp4"), torch.cat([future, clips[SEEN]], 2), take.fps)
-        log.image(f"{take.name}_frames", contact_sheet(torch.cat([future, clips[SEEN]], 1), columns=8, count=8))
-        lines = {
-            "PSNR [dB]": {name: psnr_per_frame(clip, future) for name, clip in clips.items()},
-            "SSIM": {name: ssim_per_frame(clip, future) for name, clip in clips.items()},
-        }
-        log.image(f"{take.name}_curves", curves(lines, take.fps, first=seen))
-        shown = ["recorded", SEEN, IMAGE]
-        log.image(f"{take.name}_slices", slices(shown, [future, clips[SEEN], clips[IMAGE]], *busiest(future)))
+            found[name] = _plain(measured.measure(clip)[0], take.name, notes)
+        said = [_swings(swing)] + [
+            f"{about}: {why}" for about, why in notes.items() if about.startswith(f"{take.name}: ")
+        ]
+        take_page(take.name, frames, fps, clips, found, seen=seen, said=said, best=SEEN, bar=IMAGE, log=log)
+        return {f"{take.name}: {name}": cells for name, cells in found.items()}
 
 
 def _stopped(swing: Swing, take: Take, notes: dict[str, str], log: Log) -> Swing:
@@ -164,6 +150,11 @@ def _stopped(swing: Swing, take: Take, notes: dict[str, str], log: Log) -> Swing
     notes[f"{take.name}: {SEEN}"] = why
     log.info(f"{take.name}: {why}")
     return swing.stopped()
+
+
+def _swings(swing: Swing) -> str:
+    pairs = sorted(zip(swing.modes.frequency, swing.modes.damping))
+    return "modes as the first take shows them: " + ", ".join(f"{f:.3g} Hz (damping {d:.2g} 1/s)" for f, d in pairs)
 
 
 def _plain(cells, name: str, notes: dict[str, str]) -> dict[str, float | None]:
