@@ -82,16 +82,39 @@ def write(rows: list[dict], said: list[str]) -> None:
         name: {m: float(np.mean([found[(*take, name)][m] for take in takes])) for m in MEASURES[:4]} for name in ROWS
     }
     text += [f"| mean | {' | '.join(cell(means[name]) for name in ROWS)} |", ""]
+    text += ["## Against the bars", "", *(f"- {line}" for line in bars(takes, found, means)), ""]
     text += ["## Motion: flow error, frequency [Hz], damping [1/s] of what was foretold and of what came", ""]
     text += ["| take | flow error, modes as seen | image modes | frequency | recorded | damping | recorded |"]
     text += ["|---" * 7 + "|"]
     for take in takes:
         mine, image, real = (found[(*take, name)] for name in (SEEN, IMAGE, REFERENCE))
-        values = (mine["flow_error"], image["flow_error"], mine["frequency"], real["frequency"])
-        values += mine["damping"], real["damping"]
+        values = [mine["flow_error"], image["flow_error"], mine["frequency"], real["frequency"]]
+        values += [mine["damping"], real["damping"]]
         text.append(f"| {' '.join(take)} | {' | '.join('–' if v is None else f'{v:.3g}' for v in values)} |")
     (RESULTS / "real.md").write_text("\n".join(text) + "\n")
     plot(takes, found)
+
+
+def bars(takes: list, found: dict, means: dict) -> list[str]:
+    """What is asked of the prediction, and whether it is reached."""
+    said = []
+    for name, measures in ((LAST, MEASURES[:4]), (IMAGE, MEASURES[:1])):
+        for m in measures:
+            mine, bar = means[SEEN][m], means[name][m]
+            above = sum(found[(*take, SEEN)][m] > found[(*take, name)][m] for take in takes)
+            said.append(
+                f"{m.upper().replace('_', '-')} in the mean over takes {'above' if mine > bar else 'NOT above'} that "
+                f"of {name}: {mine:.4g} against {bar:.4g}; above in {above} of {len(takes)} takes"
+            )
+    for m, share in (("frequency", 0.03), ("damping", 0.2)):
+        pairs = [(found[(*take, SEEN)][m], found[(*take, REFERENCE)][m]) for take in takes]
+        off = [abs(a / b - 1) if a is not None and b else None for a, b in pairs]
+        good = sum(e is not None and e <= share for e in off)
+        shown = ", ".join("–" if e is None else f"{100 * e:.0f} %" for e in off)
+        said.append(
+            f"{m} within {100 * share:.0f} % of what is read off the recording in {good} of {len(takes)}: {shown}"
+        )
+    return said
 
 
 def cell(row: dict) -> str:

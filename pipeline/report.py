@@ -60,6 +60,9 @@ def report(plan: Plan, hits: dict[str, bool]) -> dict[str, float]:
         for name, note in judged.notes.items():
             console.print(f"{name}: {note}", markup=False)
 
+    for page in sorted(steps["foretell"].folder.glob("*.md")) if "foretell" in steps else ():
+        if page.name != "scores.md":
+            console.print(f"take      {_near(page)}", markup=False)
     for video in sorted(steps["render"].folder.glob("*.mp4")):
         console.print(f"video     {_near(video)}", markup=False)
     with suppress(OSError):

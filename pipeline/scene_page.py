@@ -8,11 +8,13 @@ import numpy as np
 from pipeline import told
 from pipeline.embed import curve, film, page, picture
 from pipeline.filed import command, filed
+from pipeline.flow import Plan
 from pipeline.moving import of_steps
 from pipeline.replay import replay
 from pipeline.stage import Step, peek
 
 SLICES = ("slices", "space_time")  # what previews of space-time slices are called, at the end
+WIDEST = 1400  # of a picture that is shown as wide as the page [px]
 
 
 def scene_page(words: list[str]) -> tuple[str, str]:
@@ -32,6 +34,7 @@ def scene_page(words: list[str]) -> tuple[str, str]:
         films=films(steps),
         replay=replay(made),
         judged=told.scores(plan),
+        takes=takes(plan, left),
         units=_units(),
         slices=_slices(left),
         parameters=told.parameters(plan),
@@ -72,9 +75,31 @@ def films(steps: dict[str, Step]) -> list[dict[str, Any]]:
     return found
 
 
+def takes(plan: Plan, left: dict[str, told.Told]) -> list[dict[str, Any]]:
+    """Of every take that was foretold: its rows of the table, and its pictures (`physics3d/metrics/take_page.py`)."""
+    from physics3d.metrics.take_page import PICTURES
+
+    found: dict[str, dict[str, Any]] = {}
+    for table in told.scores(plan):
+        for row, cells in table.values.items() if table.step == "foretell" else ():
+            take, _, name = row.rpartition(": ")
+            found.setdefault(take, {"name": take, "rows": {}, "metrics": table.metrics, "notes": [], "pictures": []})
+            found[take]["rows"][name] = cells
+        for about, text in table.notes.items():
+            for take in found:
+                if about == take or about.startswith(f"{take}: "):
+                    found[take]["notes"].append(f"{about.removeprefix(f'{take}: ')}: {text}")
+    for take, told_of in found.items():
+        for key, what in PICTURES.items():
+            if f"{take}_{key}" in left["foretell"].previews:
+                path, _ = left["foretell"].previews[f"{take}_{key}"]
+                told_of["pictures"].append({"name": what, "picture": picture(path, WIDEST)})
+    return list(found.values())
+
+
 def _slices(left: dict[str, told.Told]) -> list[dict[str, Any]]:
-    """Space-time slices: of what was judged beside the recording, else of the video."""
-    of = [n for n in told.JUDGES if n in left] or ["render"]
+    """Space-time slices: of what was judged beside the recording, else of the video. Takes show their own."""
+    of = [n for n in told.JUDGES if n in left and n != "foretell"] or ["render"] * ("foretell" not in left)
     return [
         {"name": f"{step}: {key.replace('_', ' ')}", "picture": picture(path)}
         for step in of
@@ -95,6 +120,7 @@ def _stage(name: str, t: told.Told) -> dict[str, Any]:
         "previews": [
             {"name": key.replace("_", " "), "count": count, "picture": picture(path)}
             for key, (path, count) in t.previews.items()
+            if name != "foretell"  # of takes, which are shown above
         ],
     }
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from physics3d.checks import Text, Whole, require_fields
 from physics3d.pictures import contact_sheet
 from physics3d.scenes.base import AbstractSource, Capture
-from physics3d.scenes.clips import clip_files, filmed_takes
+from physics3d.scenes.clips import clip_files, filmed_takes, require_same_view
 from physics3d.video import write_mp4
 
 
@@ -69,6 +69,9 @@ class LoadCapture:
             raise ValueError(f"capture.clip is {self.clip}, a folder of {1 + len(more)} clips; name one of them")
         h, w = take.video.shape[1:3]
         camera = capture.seen_from(self.view, key="render.view").framed(w, h)
+        if capture.images:
+            number = capture.names.index(self.view) if isinstance(self.view, str) else self.view or 0
+            require_same_view(take, capture.images[number], clip=Path(self.clip).name, key="render.view")
         if capture.takes:
             log.info(f"left out, for a clip is learned from: {', '.join(t.name for t in capture.takes)}")
         return replace(capture, takes=(take.seen_by(camera),))

@@ -11,14 +11,13 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-import torch
 from annotated_types import Ge, Le
 from torch import Tensor
 
 from physics3d.checks import Duration, require_fields
 from physics3d.filling.body import Body
 from physics3d.gaussians.model import Gaussians
-from physics3d.learning.foretold import Moving, foretold
+from physics3d.learning.foretold import Moving, foretold, has_stopped
 from physics3d.learning.free_body import material_of
 from physics3d.learning.free_motion import Material, start
 from physics3d.learning.identify import Swing, another_take, identified
@@ -26,14 +25,11 @@ from physics3d.learning.seen_modes import observe
 from physics3d.learning.unknown_cause import Swung, by_its_own_camera, first_take, frames_seen, swung
 from physics3d.log import Log
 from physics3d.metrics.against import Reference
-from physics3d.metrics.image import psnr_per_frame, ssim_per_frame
-from physics3d.metrics.pictures import busiest, curves, slices
 from physics3d.metrics.scores import REFERENCE, Scores
+from physics3d.metrics.take_page import take_page
 from physics3d.motion.image_modes import image_modes
 from physics3d.motion.stills import stills
-from physics3d.pictures import contact_sheet
 from physics3d.scenes.base import Capture, Take
-from physics3d.video import write_mp4
 from physics3d.world import Estimate, World
 
 SEEN, LEARNED, START, IMAGE = "modes as seen", "learned material", "material before", "image modes"
@@ -51,7 +47,7 @@ class Foretell:
         """Rows are "take: prediction". Raises ValueError as `swung` does."""
         require_fields(self, "foretell")
         ready = swung(self.world, capture, gaussians, body, zones=self.zones, log=log)
-        clip, flow, _, decay, release = first_take(ready, log)
+        clip, flow, trusted, decay, release = first_take(ready, log)
         learned = material_of(self.world, estimate, ready.reduced.zone)
         before = material_of(self.world, self.world.estimate(), ready.reduced.zone)
         take, posed = ready.take, ready.take.posed
@@ -69,6 +65,8 @@ class Foretell:
         for name, material in ((LEARNED, learned), (START, before)):
             motions[name] = start(ready.reduced, material, window, reference=reference)[0]
         pose = {name: None if reference is None else motion.at(reference) for name, motion in motions.items()}
+        if has_stopped(ready.sight, swing, flow, trusted, fps=take.fps, release=release):
+            motions[SEEN] = _stopped(swing, take, notes, log)
         scores |= self.judged(ready, take, motions, flow[-1], release=release, seen=seen, notes=notes, log=log)
         for other in capture.takes:
             if other is not take:
@@ -100,10 +98,13 @@ class Foretell:
         if seen - release < 4:
             notes[take.name] = f"{len(frames)} frames, free from {release} on, are too few to be foretold"
             return {}
-        clip, flow, _ = observe(ready.sight, frames[:seen], take.fps, reference=ready.picture)
+        clip, flow, trusted = observe(ready.sight, frames[:seen], take.fps, reference=ready.picture)
         window = clip.window(release, seen)
         known = {name: None if take.at_rest else place for name, place in pose.items()}
-        motions: dict[str, Moving] = {SEEN: another_take(ready.reduced, window, first.modes, known[SEEN])}
+        swing = another_take(ready.reduced, window, first.modes, known[SEEN])
+        if has_stopped(ready.sight, swing, flow, trusted, fps=take.fps, release=release):
+            swing = _stopped(swing, take, notes, log)
+        motions: dict[str, Moving] = {SEEN: swing}
         for name, material in materials.items():
             motions[name] = start(ready.reduced, material, window, known=known[name])[0]
         return self.judged(ready, take, motions, flow[-1], release=release, seen=seen, notes=notes, log=log)
@@ -120,11 +121,13 @@ class Foretell:
         notes: dict[str, str],
         log: Log,
     ) -> dict[str, dict[str, float | None]]:
-        """Measures and pictures of what follows frame `seen` - 1."""
+        """Measures and the page of what follows frame `seen` - 1."""
         frames, fps = take.videos[0], take.fps
         future = frames[seen:]
         times = (np.arange(seen, len(frames)) - release) / fps
         last = (seen - 1 - release) / fps
+        swing = motions[SEEN]
+        assert isinstance(swing, Swing)
         clips: dict[str, Tensor] = {
             name: foretold(frames[seen - 1], ready.sight, motion, moved, last=last, times=times)
             for name, motion in motions.items()
@@ -132,26 +135,26 @@ class Foretell:
         clips[IMAGE] = image_modes(frames[:seen], fps).frames(range(seen, len(frames)))
         clips |= stills(frames, seen=seen)
         measured = Reference(future, fps)
-        rows = {f"{take.name}: {REFERENCE}": _plain(measured.itself()[0], take.name, notes)}
+        found = {REFERENCE: _plain(measured.itself()[0], take.name, notes)}
         for name, clip in log.progress(list(clips.items()), f"scoring {take.name}"):
-            rows[f"{take.name}: {name}"] = _plain(measured.measure(clip)[0], take.name, notes)
-        self.pictures(take, clips, seen, log)
-        return rows
+            found[name] = _plain(measured.measure(clip)[0], take.name, notes)
+        said = [_swings(swing)] + [
+            f"{about}: {why}" for about, why in notes.items() if about.startswith(f"{take.name}: ")
+        ]
+        take_page(take.name, frames, fps, clips, found, seen=seen, said=said, best=SEEN, bar=IMAGE, log=log)
+        return {f"{take.name}: {name}": cells for name, cells in found.items()}
 
-    def pictures(self, take: Take, clips: dict[str, Tensor], seen: int, log: Log) -> None:
-        """A film of the take beside what was foretold, curves over the frames, and space-time slices."""
-        if log.folder is None:
-            return
-        future = take.videos[0][seen:]
-        write_mp4(log.path(f"{take.name}.mp4"), torch.cat([future, clips[SEEN]], 2), take.fps)
-        log.image(f"{take.name}_frames", contact_sheet(torch.cat([future, clips[SEEN]], 1), columns=8, count=8))
-        lines = {
-            "PSNR [dB]": {name: psnr_per_frame(clip, future) for name, clip in clips.items()},
-            "SSIM": {name: ssim_per_frame(clip, future) for name, clip in clips.items()},
-        }
-        log.image(f"{take.name}_curves", curves(lines, take.fps, first=seen))
-        shown = ["recorded", SEEN, IMAGE]
-        log.image(f"{take.name}_slices", slices(shown, [future, clips[SEEN], clips[IMAGE]], *busiest(future)))
+
+def _stopped(swing: Swing, take: Take, notes: dict[str, str], log: Log) -> Swing:
+    why = "the thing has come to rest in what was seen: the last frame of it is foretold"
+    notes[f"{take.name}: {SEEN}"] = why
+    log.info(f"{take.name}: {why}")
+    return swing.stopped()
+
+
+def _swings(swing: Swing) -> str:
+    pairs = sorted(zip(swing.modes.frequency, swing.modes.damping))
+    return "modes as the first take shows them: " + ", ".join(f"{f:.3g} Hz (damping {d:.2g} 1/s)" for f, d in pairs)
 
 
 def _plain(cells, name: str, notes: dict[str, str]) -> dict[str, float | None]:

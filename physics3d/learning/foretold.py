@@ -4,6 +4,10 @@
 
 x is a pixel of the picture in which the body is where its Gaussians are, y where it is seen in the last frame, at t_l.
 The photograph keeps its sharpness, and a body that has come to rest its picture.
+
+A decay that is fitted to all that was seen goes on for ever; what rubs or touches something stops. So the last half
+period that was seen is asked: if there the thing moved by less than half of what the motion says, it has stopped. Of
+one amplitude, half a period tells at least a third of what another phase tells: a phase that is wrong is no stop.
 """
 
 import numpy as np
@@ -17,6 +21,8 @@ from physics3d.learning.seen_modes import Sight
 from physics3d.motion.carry import carried, inverse
 
 SMOOTH = 1.5  # of the displacement [px]
+STOPPED = 0.25  # of the mean square of what a motion says
+LEAST = 4  # frames that are asked
 
 Moving = FreeMotion | Swing  # a motion whose amplitudes are known at any time
 
@@ -42,3 +48,24 @@ def foretold(
         v = cv2.remap(u, x + back[..., 0], y + back[..., 1], cv2.INTER_LINEAR)
         frames.append(torch.from_numpy(carried(picture, cv2.GaussianBlur(v, (0, 0), SMOOTH))))
     return torch.stack(frames)
+
+
+def has_stopped(
+    sight: Sight,
+    swing: Swing,
+    flow: Float[np.ndarray, "t h w 2"],
+    weight: Float[np.ndarray, "t n"],
+    *,
+    fps: float,
+    release: int,
+) -> bool:
+    """Whether the thing stands still at the end of the frames seen, though it should swing. `flow` and the `weight` of
+    the pixels of the sight are of all those frames; time 0 of the swing is frame `release`."""
+    last, loudest = len(flow) - 1, swing.loudest((len(flow) - 1 - release) / fps)
+    first = max(release, last - max(LEAST, round(0.5 * fps / swing.modes.frequency[loudest])))
+    i, j = sight.pixel.T
+    end = swing.at((last - release) / fps)
+    told = np.stack([sight.jacobian @ (swing.at((k - release) / fps) - end) for k in range(first, last)])
+    seen = flow[first:last, i, j] - flow[last, i, j]
+    size = lambda u: float((weight[first:last] * (u**2).sum(-1)).sum())
+    return size(seen) < STOPPED * size(told)

@@ -70,6 +70,15 @@ class Swing:
         f = self.modes.functions(np.array([t]), self.slowing)[..., 0]
         return self.rest + self.modes.shape @ (self.amplitude * f).sum(1)
 
+    def loudest(self, t: float) -> int:
+        """The oscillation with the largest displacement around time t [s]."""
+        size = np.linalg.norm(self.modes.shape, axis=0) * np.linalg.norm(self.amplitude, axis=1)
+        return int(np.argmax(size * np.exp(-self.modes.damping * t)))
+
+    def stopped(self) -> "Swing":
+        """The same, at rest from now on."""
+        return replace(self, amplitude=np.zeros_like(self.amplitude))
+
 
 def oscillations(
     f: Float[np.ndarray, " j"], d: Float[np.ndarray, " j"], slowing: float, t: Float[np.ndarray, " n"]

@@ -23,6 +23,7 @@ from physics3d.world import Estimate, World
 
 SHAPES = 3  # of the flow, that the clip's frequencies are read off
 LEAST = 12  # frames that a motion is learned from
+BESIDE = 0.05  # of what moves; flow runs over outlines, so that of a thin thing most is beside it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,6 +77,12 @@ def first_take(
     where = moving(u)
     if where is None:
         raise ValueError(f"take {body.take.name}: nothing moves in the {len(frames)} frames that are seen")
+    share = float(where[body.sight.thing].sum() / where.sum())
+    if share < BESIDE:
+        raise ValueError(
+            f"take {body.take.name}: only {100 * share:.0f} % of what moves is where the thing is seen; the clip shows "
+            "something else that moves, or the prompts name another thing: set scene.prompts"
+        )
     where &= body.sight.thing
     weight = np.ones(u.shape[:3], np.float32)
     signal = shapes(u, weight, where, count=SHAPES).signal

@@ -6,8 +6,8 @@ from torch import Tensor
 from physics3d.pictures import space_time_slice
 
 
-def slices(names: list[str], clips: list[UInt8[Tensor, "t h w 3"]], row: int, column: int):
-    """One row and one column of pixels of every clip against time."""
+def slices(names: list[str], clips: list[UInt8[Tensor, "t h w 3"]], row: int, column: int, *, mark: int | None = None):
+    """One row and one column of pixels of every clip against time; a line where frame `mark` begins."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(3 * len(names), 5.2), layout="constrained")
@@ -20,6 +20,8 @@ def slices(names: list[str], clips: list[UInt8[Tensor, "t h w 3"]], row: int, co
         ):
             axis = figure.add_subplot(2, len(names), 1 + i + k * len(names))
             axis.imshow(picture.numpy(), aspect="auto", interpolation="nearest")
+            if mark is not None:
+                (axis.axvline if k else axis.axhline)(mark - 0.5, color="red", lw=1)
             axis.set(title=f"{name}\n{what}" if k == 0 else what, xticks=[], yticks=[])
     return figure
 

@@ -19,6 +19,11 @@ from physics3d.motion.decay import Decay
 from physics3d.motion.usable import check_clip
 from physics3d.scenes.base import Take
 from physics3d.scenes.unposed import VIDEOS
+from physics3d.video import reduced
+
+ALIKE = 0.7  # correlation of two pictures of one view; measured: 0.94 or more, other things 0.35 or less
+COARSE = 48  # longer side of the pictures that are compared [px]
+FLAT = 2.0  # standard deviation of a picture that tells nothing [grey levels]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +56,28 @@ class FilmedTake:
             release=self.release,
             posed=self.rest,
             at_rest=True,
+        )
+
+
+def require_same_view(take: FilmedTake, photograph: UInt8[Tensor, "H W 3"], *, clip: str, key: str) -> None:
+    """Raises ValueError, naming the clip and the `key` that chooses the photograph, unless the frame of rest shows, in
+    its middle, what the photograph shows: by the correlation of their greys, whatever exposure and contrast are."""
+    h, w = take.video.shape[1:3]
+    H, W = photograph.shape[:2]
+    s = min(w / W, h / H)
+    across, down = round(s * W), round(s * H)
+    top, left = (h - down) // 2, (w - across) // 2
+    frame = take.video[take.rest, top : top + down, left : left + across]
+    size = tuple(max(1, round(COARSE * side / max(down, across))) for side in (down, across))
+    a, b = (reduced(picture[None], *size).double().mean(-1).ravel() for picture in (frame, photograph))
+    a, b = a - a.mean(), b - b.mean()
+    if min(float(a.std()), float(b.std())) < FLAT:
+        return
+    alike = float(a @ b / (a.norm() * b.norm()))
+    if alike < ALIKE:
+        raise ValueError(
+            f"{clip}: it does not show what the photograph of {key} shows (their correlation is {alike:.2f}, of one "
+            f"view {ALIKE:g} or more); make the clip from the picture of `make still`, or name its photograph by {key}"
         )
 
 

@@ -5,8 +5,9 @@ import pytest
 from scipy import linalg
 from test_learning_free_motion import FPS, chain
 
+from physics3d.learning.foretold import has_stopped
 from physics3d.learning.identify import another_take, identified
-from physics3d.learning.seen_modes import Observed
+from physics3d.learning.seen_modes import Observed, Sight
 from physics3d.log import Log
 from physics3d.motion.decay import fit_decay
 
@@ -35,7 +36,7 @@ def swung(body, start, slowing, frames, rng, noise=0.02):
     return q + noise / 5 * rng.standard_normal(q.shape)
 
 
-def seen(places, reference):
+def observed(places, reference):
     """Every mass is a pixel that moves by five times its place."""
     J, u = 5 * np.eye(places.shape[1]), 5 * (places - reference)
     return Observed(
@@ -49,7 +50,7 @@ def test_oscillations_come_back_and_foretell_what_follows(slowing):
     f, _ = other_system(body)
     places = swung(body, np.array([0.2, 0.12]), slowing, 150, rng)
     half = places[:75]
-    swing = identified(body, seen(half, half[-1]), fit_decay(half, FPS), reference=74 / FPS, log=Log(None))
+    swing = identified(body, observed(half, half[-1]), fit_decay(half, FPS), reference=74 / FPS, log=Log(None))
     order = np.argsort(swing.modes.frequency)
     # frames of noise of a tenth of the second amplitude; what is likely beforehand draws the slowing a little to zero
     assert swing.modes.frequency[order] == pytest.approx(f, rel=0.01)
@@ -65,11 +66,54 @@ def test_another_take_has_its_own_start_and_rest():
     body, rng = chain(zones=1), np.random.default_rng(1)
     first = swung(body, np.array([0.2, 0.12]), 0.06, 75, rng)
     known = first[-1]
-    swing = identified(body, seen(first, known), fit_decay(first, FPS), reference=74 / FPS, log=Log(None))
+    swing = identified(body, observed(first, known), fit_decay(first, FPS), reference=74 / FPS, log=Log(None))
     rest = 0.03 * np.linspace(0, 1, len(known))
     places = rest + swung(body, np.array([-0.1, 0.1]), 0.06 / 4, 90, rng)
-    other = another_take(body, seen(places[:15], known), swing.modes, swing.at(74 / FPS))
+    other = another_take(body, observed(places[:15], known), swing.modes, swing.at(74 / FPS))
     foretold = np.stack([other.at(t / FPS) - other.at(14 / FPS) for t in range(15, 90)])
     left, moved = foretold - (places[15:] - places[14]), places[15:] - places[14]
     assert np.square(left).sum() < 0.1 * np.square(moved).sum()
     assert 0 < other.slowing < swing.slowing
+
+
+def told_of(body, places, seen):
+    """(whether it is taken for stopped, what is foretold from the last of `seen` frames on), every mass a pixel."""
+    known, pixels = places[seen - 1], len(body.mass)
+    flow = np.stack([5 * (places[:seen] - known), np.zeros((seen, pixels))], -1)[:, None]
+    decay = fit_decay(places[:seen], FPS)
+    swing = identified(body, observed(places[:seen], known), decay, reference=(seen - 1) / FPS, log=Log(None))
+    stopped = has_stopped(sight_of(pixels), swing, flow, np.ones((seen, pixels)), fps=FPS, release=0)
+    final = swing.stopped() if stopped else swing
+    end = final.at((seen - 1) / FPS)
+    return stopped, np.stack([final.at(t / FPS) - end for t in range(seen, len(places))])
+
+
+def sight_of(pixels):
+    J = np.zeros((pixels, 2, pixels))
+    J[:, 0] = 5 * np.eye(pixels)
+    pixel = np.stack([np.zeros(pixels, int), np.arange(pixels)], 1)
+    return Sight(thing=np.ones((1, pixels), bool), pixel=pixel, jacobian=J)
+
+
+@pytest.mark.parametrize("phase", [0.0, 1.5])
+@pytest.mark.parametrize("end", [35, 55, 63])
+def test_what_has_come_to_rest_stays_there(phase, end):
+    """Dry friction stops a swing at one instant, which no sum of decays does. Twelve frames of rest are seen at least;
+    half a period is five."""
+    body, rng = chain(zones=1), np.random.default_rng(end)
+    f, shape = other_system(body)
+    t = np.arange(150)
+    swing = 0.2 * np.maximum(0, 1 - t / end) * np.cos(2 * np.pi * f[0] * t / FPS + phase)
+    clean = swing[:, None] * shape[:, 0]
+    stopped, foretold = told_of(body, clean + 0.002 * np.abs(clean).max() * rng.standard_normal(clean.shape), 75)
+    assert stopped and not foretold.any()
+
+
+@pytest.mark.parametrize("seen", range(60, 80, 4))
+def test_what_still_swings_is_not_taken_for_stopped(seen):
+    """Whatever the phase in which the last frame catches it, a turn included."""
+    body, rng = chain(zones=1), np.random.default_rng(seen)
+    places = swung(body, np.array([0.2, 0.12]), 0.06, 150, rng, noise=0.1)
+    stopped, foretold = told_of(body, places, seen)
+    moved = places[seen:] - places[seen - 1]
+    assert not stopped and np.square(foretold - moved).sum() < 0.5 * np.square(moved).sum()

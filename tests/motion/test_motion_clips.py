@@ -135,6 +135,53 @@ def test_every_fault_is_found_and_named(tmp_path, message):
     assert "\n" not in str(error.value)
 
 
+T = np.arange(len(SWAY)) / FPS
+BACK = swaying(SWAY)
+KINDS = {  # further instances of each fault
+    "pans slowly": ("the camera moves", lambda: warped(shift=1.5 * T)),
+    "zooms by 4 %": ("the camera moves", lambda: warped(zoom=1 + 0.02 * T)),
+    "is held by hand": ("the camera moves", lambda: warped(shift=2 * np.sin(2 * np.pi * 0.7 * T) + np.sin(11 * T))),
+    "cut near its end": ("there is a cut before frame 57", lambda: torch.cat([BACK[:57], 255 - BACK[57:]])),
+    "ends in black": ("there is a cut before frame 55", lambda: torch.cat([BACK[:55], 0 * BACK[55:]])),
+    "cut within a scene": ("a cut before frame 30", lambda: torch.cat([BACK[:30], warped(shift=30 + 0 * T)[30:]])),
+    "leaves and comes back": ("leaves the picture", lambda: swaying(SWAY - 40 * np.exp(-(((T - 1) / 0.3) ** 2)))),
+    "flickers, nothing moves": ("nothing moves", lambda: lit(swaying(0 * SWAY), 1 + 0.05 * np.cos(9 * T))),
+    "drifts one way": ("shorter than half a period", lambda: swaying(6 * T)),
+}
+
+
+def lit(video, light):
+    return (video * torch.tensor(light)[:, None, None, None]).clamp(0, 255).byte()
+
+
+def warped(shift=0 * T, zoom=1 + 0 * T):
+    """The swaying thing by a camera that moves: every frame drawn aside by `shift` [px] and larger by `zoom`."""
+    import cv2
+
+    h, w = BACK.shape[1:3]
+    y, x = np.mgrid[:h, :w].astype(np.float32)
+    at = lambda s, z: (((x - w / 2) / z + w / 2 - s).astype(np.float32), ((y - h / 2) / z + h / 2).astype(np.float32))
+    drawn = [
+        cv2.remap(frame, *at(s, z), cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+        for frame, s, z in zip(BACK.numpy(), shift, zoom)
+    ]
+    return torch.from_numpy(np.stack(drawn))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_of_a_fault_is_found(tmp_path, kind):
+    message, make = KINDS[kind]
+    with pytest.raises(ValueError, match=message):
+        judged(tmp_path, make())
+
+
+def test_light_that_changes_is_no_fault(tmp_path):
+    """A lamp at 3 Hz, 5 %; a cloud, 20 % in the end."""
+    for light in (1 + 0.05 * np.sin(2 * np.pi * 3 * T), 1 - 0.1 * T):
+        found = judged(tmp_path, lit(BACK, light))
+        assert found.decay.frequency[found.decay.main()] == pytest.approx(2.0, rel=0.03)
+
+
 def test_takes_of_a_folder_are_one_to_learn_and_others_to_predict(tmp_path, sway):
     for name, frames in (("b.mp4", sway), ("a.mov", swaying(-0.7 * SWAY))):
         encode(frames, tmp_path / name)

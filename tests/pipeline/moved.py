@@ -11,6 +11,8 @@ from physics3d.filling.body import Body
 from physics3d.gaussians.cameras import Camera, look_at
 from physics3d.gaussians.model import Gaussians
 from physics3d.log import Log
+from physics3d.metrics.scores import Scores
+from physics3d.metrics.take_page import take_page
 from physics3d.scenes.base import Capture
 from physics3d.trajectory import Trajectory
 from pipeline.flow import first, plan
@@ -85,3 +87,44 @@ def run_all(config: dict) -> dict[str, Step]:
     for step in whole.steps:
         run(step, "cpu")
     return {step.name: step for step in whole.steps}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Film:
+    """The same, with two takes of which nobody knows what pushed the body; their names may be any words."""
+
+    names: tuple[str, str] = ("a: poke", "<b>")
+
+    def __call__(self, *, log: Log) -> Capture:
+        from dataclasses import replace
+
+        capture = Shoot()(log=log)
+        video = torch.randint(0, 255, (30, 48, 64, 3), generator=torch.Generator().manual_seed(0)).byte()
+        takes = tuple(
+            replace(take, name=name, videos=(video,), excitation=None) for name, take in zip(self.names, capture.takes)
+        )
+        return replace(capture, takes=takes)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Predict:
+    """Foretells what the last frame seen shows, and writes the pages of the takes."""
+
+    def __call__(self, capture: Capture, *inputs: object, log: Log) -> Scores:
+        values = {}
+        for k, take in enumerate(capture.takes):
+            seen, video = 15, take.videos[0]
+            clips = {name: video[seen - 1].expand(15, -1, -1, -1) for name in ("modes as seen", "image modes")}
+            rows = {name: {"psnr": 10.125 + k, "frequency": None} for name in clips}
+            take_page(
+                take.name, video, take.fps, clips, rows,
+                seen=seen, said=["it swings"], best="modes as seen", bar="image modes", log=log,
+            )  # fmt: skip
+            values |= {f"{take.name}: {name}": row for name, row in rows.items()}
+        return Scores(values=values, notes={f"{capture.takes[0].name}: frequency": "nothing swings"})
+
+
+def foretold_configuration(folder: Path) -> dict:
+    """Of a run whose takes have no known cause."""
+    stages = {"capture": {"_target_": "moved.Film"}, "foretell": {"_target_": "moved.Predict"}}
+    return moved_configuration(folder) | stages

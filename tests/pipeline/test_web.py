@@ -1,12 +1,14 @@
 """make report: one file that needs no network, shows in a browser, and says what the tables of the run say."""
 
+import html
 import os
 import re
 from html.parser import HTMLParser
+from urllib.parse import unquote
 
 import numpy as np
 import pytest
-from moved import moved_configuration, run_all
+from moved import foretold_configuration, moved_configuration, run_all
 from PIL import Image
 from report_picture import chromium, shot
 
@@ -82,6 +84,26 @@ def test_the_page_of_a_scene_says_what_the_run_says(report, scene, tmp_path):
         assert name in page.words
     # two films of five frames and the recorded one; the replay; a slider above and one below
     assert page.tags.count("canvas") == 4 and page.tags.count("input") == 2
+
+
+def test_every_take_that_was_foretold_has_its_table_and_pictures(tmp_path, monkeypatch):
+    """On the page of the run, and as a page of its own in the folder of the stage, whose links all lead somewhere."""
+    config = foretold_configuration(tmp_path)
+    folder = run_all(config)["foretell"].folder
+    for module in (filed, shelf_page):
+        monkeypatch.setattr(module, "compose", lambda words: (config, {}))
+    assert web.main(["scene=toy"], {"OUT": str(tmp_path / "a.html")}) == 0
+    text = (tmp_path / "a.html").read_text()
+    page = Page(text)
+    for k, take in enumerate(("a: poke", "<b>")):
+        (at,) = (i for i, word in enumerate(page.words) if word == take)
+        assert page.words[at:].index(f"{10.125 + k:.4g}") < 20 and "recorded and foretold, " + take in page.words
+        assert len(re.findall(f'alt="{html.escape(take)}: ', text)) == 3
+        own = (folder / f"{take}.md").read_text()
+        links = [unquote(link) for link in re.findall(r"\]\(([^)]*)\)", own)]
+        assert len(links) == 4 and all((folder / link).is_file() for link in links)
+        assert "15 of 30 frames at 1 fps were seen" in own and f"{10.125 + k:.4g}" in own
+    assert "frequency: nothing swings" in page.words
 
 
 def test_the_page_of_all_runs_has_every_run_once(report, scene, tmp_path):

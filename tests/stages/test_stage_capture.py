@@ -5,12 +5,13 @@ import json
 import numpy as np
 import pytest
 import torch
-from clips import FPS, decaying, encode, swinging_rod
+from clips import FPS, decaying, encode, swaying, swinging_rod
 from PIL import Image
 
 from physics3d.gaussians.cameras import Camera, look_at
 from physics3d.log import Log
 from physics3d.scenes.base import AbstractSource, Capture, Take
+from physics3d.scenes.clips import filmed_takes, require_same_view
 from physics3d.video import read_mp4
 from stages.capture import LoadCapture
 
@@ -96,3 +97,23 @@ def test_a_clip_that_cannot_be_learned_from_is_refused(tmp_path):
     for clip, view, word in (("still.mp4", None, "still.mp4"), ("none.mp4", None, "no clip at")):
         with pytest.raises(ValueError, match=word):
             LoadCapture(source=scene, clip=str(tmp_path / clip), view=view)(log=Log(None))
+
+
+@pytest.mark.parametrize("more", [(0, 40), (30, 0)])
+def test_a_clip_has_to_show_what_the_photograph_shows(tmp_path, more):
+    """In its middle, whatever its shape, size and exposure; another thing, or the same one from aside, is refused."""
+    h, w = 96 + more[0], 128 + more[1]
+    film = swaying(decaying(np.arange(24) / FPS), h=h, w=w)
+    top, left = more[0] // 2, more[1] // 2
+    photograph = (0.6 * film[-1, top : top + 96, left : left + 128].float() + 30).byte()
+    encode(film, tmp_path / "made.mp4")
+    (take,) = filmed_takes(tmp_path / "made.mp4", log=Log(None))
+    require_same_view(take, photograph, clip="made.mp4", key="render.view")
+    require_same_view(take, photograph.repeat_interleave(2, 0).repeat_interleave(2, 1), clip="made.mp4", key="")
+    for other in (photograph.roll(32, 1), swinging_rod(np.zeros(1))[0]):
+        cameras = (small(128, 96), small(*other.shape[1::-1]))
+        scene = Capture(name="scene", images=(photograph, other), cameras=cameras, names=("a", "b"))
+        stage = LoadCapture(source=Fixed(scene), clip=str(tmp_path / "made.mp4"), view="b")
+        with pytest.raises(ValueError, match=r"made\.mp4: it does not show what .* render\.view shows") as error:
+            stage(log=Log(None))
+        assert "\n" not in str(error.value)
