@@ -132,6 +132,12 @@ def boxes(name: str, size: tuple[float, float, float], solid: Solid, cells: tupl
         )  # fmt: skip
 
 
+def poked() -> list[swaying_motion.Row]:
+    found = swaying_motion.poke(*plant_solid())
+    draw_poke(found)
+    return swaying_motion.poked(found)
+
+
 def whole(x: np.ndarray) -> np.ndarray:
     return np.ones(len(x), bool)
 
@@ -195,6 +201,7 @@ MOTIONS: dict[str, Callable[[list[dict]], list[swaying_motion.Row]]] = {
     "bending": lambda rows: swaying_motion.bending(),
     "bar": lambda rows: swaying_motion.bar(),
     "energy": lambda rows: swaying_motion.energy(),
+    "poke": lambda rows: poked(),
     "speed": lambda rows: swaying_motion.speed(*plant_solid()),
 }
 
@@ -285,6 +292,8 @@ def write(rows: list[dict], must: list[swaying_motion.Row]) -> None:
         limit, holds = (f"{bar:.3g} {unit}", "yes" if measured <= bar else "**no**") if bar < math.inf else ("", "")
         lines.append(f"| {what} | {measured:.3g} {unit} | {limit} | {holds} |")
     lines += ["", *swaying_motion.__doc__.split("\n\n")[1].strip().splitlines(), ""]
+    if (RESULTS / "swaying_poke.png").exists():
+        lines += ["![error against run time](swaying_poke.png)", ""]
     lines += ["## Frequencies", "", "![errors](swaying.png)", ""]
     lines += ["| body | truth | exact [Hz] | splines | reduced | error | reduced | fields | points | to build [s] |"]
     lines += ["|---|---|---|---|---|---|---|---|---|---|"]
@@ -294,6 +303,23 @@ def write(rows: list[dict], must: list[swaying_motion.Row]) -> None:
         lines.append("| " + " | ".join(str(cell) for cell in cells) + " |")
     lines += ["", "Errors are the largest of the frequencies in the row.", ""]
     (RESULTS / "swaying.md").write_text("\n".join(lines))
+
+
+def draw_poke(found: list[swaying_motion.Poked]) -> None:
+    """Error against run time, one line a solver."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6, 3.6), layout="constrained")
+    axis = figure.subplots()
+    for solver, mark in (("modes", "o-"), ("grid", "s-")):
+        own = [one for one in found if one.solver == solver]
+        axis.loglog([one.seconds for one in own], [100 * one.error for one in own], mark, label=solver)
+        for one in own:
+            axis.annotate(f" {1e3 * one.spacing:g} mm", (one.seconds, 100 * one.error), fontsize=7)
+    axis.set(xlabel="processor time, all included [s]", ylabel="error of the displacement [%]")
+    axis.set_title("the carnation twin's poke, against finite elements", fontsize=9)
+    axis.legend()
+    figure.savefig(RESULTS / "swaying_poke.png", dpi=100)
 
 
 def draw(rows: list[dict]) -> None:

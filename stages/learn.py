@@ -26,7 +26,6 @@ from physics3d.checks import (
 )
 from physics3d.filling.body import Body
 from physics3d.filling.in_world import look_ahead, say_resolution
-from physics3d.filling.section import Section
 from physics3d.gaussians.model import Gaussians
 from physics3d.learning.chain import chain_of
 from physics3d.learning.course import Point, history
@@ -194,12 +193,13 @@ class Learn:
             if asked_for(losses, finer, seen.evidence, log):
                 field, theta, chain, seen = finer, more, over, shown(over, finer, more, seed=self.seed)
                 known = {name: [*known.get(name, []), *curve] for name, curve in history(finer, descent).items()}
+        beyond = self.beyond.of(section, self.world.dx, on_grid=chain.on_grid)
         learned = replace(
             start,
             parameters={name: v.detach().to(torch.float32) for name, v in field.parameters(theta).items()},
             velocity=field.velocity(theta).detach().to(torch.float32),
             history=known,
-            intervals=self.intervals(field, theta, seen, section if chain.on_grid else None, log) if seen else {},
+            intervals=self.intervals(field, theta, seen, beyond, log) if seen else {},
         )
         self.report(capture, field, learned, seen, log)
         if log.folder is not None:
@@ -281,13 +281,9 @@ class Learn:
         return search(chain, field, directions, offsets, seed=self.seed, log=log)
 
     def intervals(
-        self, field: AbstractField, theta: Tensor, seen: Shown, section: Section | None, log: Log
+        self, field: AbstractField, theta: Tensor, seen: Shown, beyond: Beyond, log: Log
     ) -> dict[str, Interval]:
-        """Of every learned number. `section`: the thinnest beside what is held, by which a grid may be coarser than
-        is usual."""
-        beyond = self.beyond
-        if section is not None:
-            beyond = replace(beyond, grid=max(beyond.grid, 2 * section.grid_error(self.world.dx)))
+        """Of every learned number; `beyond`: what pictures do not show."""
         unit = field.velocity_scale or 1.0
         speed = [float(v) / unit for v in field.velocity(theta)] if field.velocity_scale else []
         stiff = np.array([float(is_stiff(name)) for name in field.names])

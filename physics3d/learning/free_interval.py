@@ -11,6 +11,7 @@ no force, so density and length go into it as stiffness does.
 """
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -80,7 +81,7 @@ def free_posterior(
             share=each(shares),
         ),
         before=before,
-        beyond=beyond.covariance(stiff, np.zeros(len(theta)), np.zeros(len(theta))),
+        beyond=replace(beyond, grid=beyond.modes).covariance(stiff, np.zeros(len(theta)), np.zeros(len(theta))),
         log=log,
     )
 

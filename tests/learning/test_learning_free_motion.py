@@ -122,7 +122,7 @@ def test_intervals_of_a_free_motion_hold_the_truth():
     jacobian = np.stack([np.eye(count) * 5, np.zeros((count, count))], 1)
     sight = Sight(thing=line, pixel=np.argwhere(line), jacobian=jacobian)
     known = np.array([truth.stiffness, truth.ratio, truth.time])
-    none = Beyond(surface=0.0, grid=0.0, density=0.0, length=0.0)
+    none = Beyond(surface=0.0, grid=0.0, modes=0.0, density=0.0, length=0.0)
     hits, widths, last = 0, [], 74 / FPS
     for seed in range(4):
         clip, (_, seen) = filmed(body, truth, np.random.default_rng(seed), noise=0.1, memory=0.7)
