@@ -9,6 +9,8 @@ pyvista`. Exit codes: 0 done, 1 it cannot be done, 2 a word means nothing, 130 C
 
 import importlib.util
 import sys
+import tempfile
+from pathlib import Path
 
 from pipeline.filed import megabytes, one_line
 from pipeline.settings import SettingsError, compose
@@ -28,9 +30,6 @@ def write(words: list[str]) -> None:
     except ValueError:
         raise SettingsError(f"{own}: edge is a length in m, steps a whole number") from None
     settings, _ = compose([w for w in words if not w.startswith(("edge=", "steps="))])
-    if any(importlib.util.find_spec(name) is None for name in ("pytetwild", "pyvista")):
-        raise ValueError("the mesher is missing; pip install pytetwild pyvista")
-
     from hydra.utils import instantiate
 
     from physics3d.log import Log
@@ -42,9 +41,11 @@ def write(words: list[str]) -> None:
     source = instantiate(settings["scene"]["source"])
     if not isinstance(source, CarnationTwin | MadeTwin):
         raise ValueError(f"scene.source is a {type(source).__name__}; finite elements are made for twins that are held")
+    if any(importlib.util.find_spec(name) is None for name in ("pytetwild", "pyvista")):
+        raise ValueError("the mesher is missing; pip install pytetwild pyvista")
     world = source.world if isinstance(source, MadeTwin) else source.world()
     name = source.name if isinstance(source, MadeTwin) else "carnation"
-    solids, log = source.solids(), Log(None)
+    solids = source.solids()
     body = finite_elements.meshed(solids, world, edge)
     print(f"mesh      {body.gradient.shape[1]} nodes, {1e6 * body.weight.sum():.1f} cm^3", flush=True)
     found = finite_elements.frequencies(body, world, 4)
@@ -52,7 +53,9 @@ def write(words: list[str]) -> None:
     place, _ = particles(solids, world.dx / 2, source.seed)
     moved = {}
     for role, push in source.pokes().items():
-        films = finite_elements.swing(body, world, push, frames=source.frames, fps=source.fps, steps=steps, log=log)
+        with tempfile.TemporaryDirectory(prefix="physics3d_") as notes:
+            log = Log(Path(notes), name=role)
+            films = finite_elements.swing(body, world, push, frames=source.frames, fps=source.fps, steps=steps, log=log)
         position, deformation = finite_elements.carried(body, films, place)
         moved[role] = reference_motion.Moved(place=place, position=position, deformation=deformation)
         print(f"moved     {role}: by up to {1e3 * abs(position - place).max():.1f} mm", flush=True)
