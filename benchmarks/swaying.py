@@ -1,6 +1,7 @@
 """The solver without a grid against closed forms and against finite elements.
 
-    make bench-swaying [ARGS="rows=beam,plant"]   ->   docs/results/swaying.csv, swaying_must.csv, .md, .png
+    make bench-swaying   ->   docs/results/swaying.csv, swaying_must.csv, .md, .png, swaying_poke.png
+    make bench-swaying ARGS="rows=beam,poke"   prints these alone, and leaves the page as it is
 
 Beams: Timoshenko (transfer matrix), clamped along an axis and free where turned. Plate, L- and Y-shape: quadratic
 hexahedra on a mesh that fits, by scikit-fem. The plant of the carnation twin: quadratic tetrahedra by scikit-fem on a
@@ -49,7 +50,8 @@ def main(words: list[str]) -> None:
         for law in MOTIONS[name](rows) if name in MOTIONS else ():
             print(law, flush=True)
             must.append(law)
-    write(rows, [*of_frequencies(rows), *must])
+    if "rows" not in options:  # a page tells of all of them
+        write(rows, [*of_frequencies(rows), *must])
 
 
 def of_frequencies(rows: list[dict]) -> list[swaying_motion.Row]:
