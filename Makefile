@@ -93,7 +93,7 @@ score: $(ready) ## any two videos compared: REAL=<clip> PRED=<clip> [OUT=<folder
 twin: $(ready) ## a thing with known material as photographs and clips on disk: OUT=<new folder>
 	@$(threads) $(py) -m pipeline.twin
 
-reference-motion: $(ready) ## how a twin moves by finite elements, kept for its scene: [ARGS="scene.source.seed=1"]; pip install pytetwild pyvista
+reference-motion: $(ready) ## how a twin moves by finite elements, kept for its scene; pip install pytetwild pyvista
 	@$(threads) $(with_args) -m pipeline.reference_motion $(of_run)
 
 train-prior: $(ready) ## a small video model from films it makes; goes on where it was: [OUT=outputs/tiny_video] [ARGS="steps=... seed=0 device=cpu"]

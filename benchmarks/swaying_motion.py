@@ -103,7 +103,7 @@ class Poked:
 def poke(inside: Callable[[np.ndarray], np.ndarray], vertices: np.ndarray) -> list[Poked]:
     """Against its reference motion, which is that of finite elements: by the modes, and by the grid."""
     twin = CarnationTwin()
-    kept = path_of("carnation", twin.seed)
+    kept = path_of("carnation")
     known = recorded(kept, twin.world(), twin.pokes(), twin.solids(), frames=twin.frames, fps=twin.fps)
     if known is None:
         raise SystemExit(f"error: {kept} is not that of the twin; make reference-motion")

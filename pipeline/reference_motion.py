@@ -1,4 +1,4 @@
-"""make reference-motion SCENE=carnation [ARGS="scene.source.seed=1"]: how a twin moves by finite elements.
+"""make reference-motion SCENE=carnation: how a twin moves by finite elements.
 
     python -m pipeline.reference_motion scene=carnation [words of the configuration] [edge=0.010] [steps=6]
 
@@ -60,7 +60,7 @@ def write(words: list[str]) -> None:
         moved[role] = reference_motion.Moved(place=place, position=position, deformation=deformation)
         print(f"moved     {role}: by up to {1e3 * abs(position - place).max():.1f} mm", flush=True)
     made = f"finite elements: scikit-fem, {body.gradient.shape[1]} nodes of quadratic tetrahedra, {steps} steps a frame"
-    path = reference_motion.path_of(name, source.seed)
+    path = reference_motion.path_of(name)
     error = reference_motion.save(path, world, source.pokes(), solids, source.fps, moved, made)
     print(f"written   {path}   {megabytes(path.stat().st_size)}, positions to {1e6 * error:.0f} micrometres")
 

@@ -98,7 +98,7 @@ def test_the_page_shows_every_field_and_the_defaults_it_departs_from(choice):
 # where the page is not the class: the page is for ten minutes on two cores, the class for no scene in particular
 TUNED = {
     "reconstruct.iterations", "reconstruct.max_gaussians", "learn.steps", "learn.polish", "learn.learning_rate",
-    "learn.search", "learn.search_span", "simulate.force",
+    "learn.search", "learn.search_span", "simulate.force", "world.solver",
 }  # fmt: skip
 
 

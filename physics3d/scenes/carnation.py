@@ -68,7 +68,7 @@ class CarnationTwin(AbstractSource):
     device: Device = "cpu"
 
     def files(self) -> tuple[str, ...]:
-        kept = path_of("carnation", self.seed)
+        kept = path_of("carnation")
         return (str(kept),) if kept.exists() else ()
 
     @property

@@ -71,7 +71,7 @@ class MadeTwin(AbstractSource):
             raise ValueError("source.moving has no shape that is full; nothing would move, make one of them full")
 
     def files(self) -> tuple[str, ...]:
-        kept = path_of(self.name, self.seed)
+        kept = path_of(self.name)
         return (str(kept),) if kept.exists() else ()
 
     @property

@@ -4,9 +4,9 @@ Finite elements take minutes and a mesher that nobody else needs, so their answe
 
     x(X, t) = X + sum_k a_k(t) phi_k(X),    F(X, t) = I + sum_k a_k(t) Phi_k(X)      (singular value decomposition)
 
-at the material points that carry the twin's vertices. A file serves one twin only: solids, material, holds and pushes
-are written in it and compared; any other twin is moved by the grid, and the log says so. `make reference-motion`
-writes it.
+at the material points that carry the twin's vertices. A file serves one twin only, whatever its seed paints and
+scatters: solids, material, holds and pushes are written in it and compared; any other twin is moved by the grid, and
+the log says so. `make reference-motion` writes it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -37,8 +37,8 @@ class Moved:
     deformation: Float[np.ndarray, "t p 3 3"]  # F [1]
 
 
-def path_of(name: str, seed: int) -> Path:
-    return FOLDER / f"{name}_{seed}.npz"
+def path_of(name: str) -> Path:
+    return FOLDER / f"{name}.npz"
 
 
 def described(world: World, pokes: Pokes) -> str:

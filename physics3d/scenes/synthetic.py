@@ -66,7 +66,7 @@ def captured(
     """
     images, alphas, found, colors = photographs(studio.pose(), cameras, points=points, noise=noise, seed=seed, log=log)
     position, volume = matter
-    kept = recorded(path_of(name, seed), world, pokes, solids, frames=frames, fps=fps)
+    kept = recorded(path_of(name), world, pokes, solids, frames=frames, fps=fps)
     by = f"the grid, cells of {1e3 * world.dx:.2g} mm" if kept is None else kept[1]
     log.info(f"reference motion: {by}")
     takes = [

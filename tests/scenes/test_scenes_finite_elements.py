@@ -97,9 +97,11 @@ def test_what_lies_in_the_tetrahedra_is_carried_by_them():
     np.testing.assert_allclose(F[0], np.eye(3) + slope, atol=1e-9)
 
 
-@pytest.mark.parametrize("kept", sorted(reference_motion.FOLDER.glob("carnation_*.npz")), ids=lambda path: path.stem)
-def test_a_motion_that_is_kept_is_that_of_the_twin_as_it_is_and_of_no_other(kept):
-    twin = CarnationTwin(seed=int(kept.stem.split("_")[1]))
+@pytest.mark.parametrize("seed", (0, 3))
+def test_the_motion_that_is_kept_is_that_of_the_twin_as_it_is_and_of_no_other(seed):
+    """A seed paints and scatters petals; what deforms, and so the motion, is the same."""
+    twin = CarnationTwin(seed=seed)
+    kept = reference_motion.path_of("carnation")
     asked = dict(frames=twin.frames, fps=twin.fps)
     found = reference_motion.recorded(kept, twin.world(), twin.pokes(), twin.solids(), **asked)
     assert found is not None, "the twin has changed since; make reference-motion"
@@ -111,11 +113,10 @@ def test_a_motion_that_is_kept_is_that_of_the_twin_as_it_is_and_of_no_other(kept
         assert np.abs(take.position - take.place)[:, still].max() < 2e-5  # of half precision
         assert np.abs(take.position - take.place).max() > 0.01
         assert np.linalg.det(take.deformation).min() > 0.5
-    stiffer = replace(twin, youngs_modulus=1.6e5)
-    pushed = replace(twin, learn_force=(0.1, 0.0, 0.0))
-    other = CarnationTwin(seed=twin.seed + 7)
-    for strange in (stiffer, pushed, other):
+    for strange in (replace(twin, youngs_modulus=1.6e5), replace(twin, learn_force=(0.1, 0.0, 0.0))):
         assert reference_motion.recorded(kept, strange.world(), strange.pokes(), strange.solids(), **asked) is None
+    thicker = [replace(mesh, vertices=1.01 * mesh.vertices) for mesh in twin.solids()]
+    assert reference_motion.recorded(kept, twin.world(), twin.pokes(), thicker, **asked) is None
     for timing in (dict(frames=twin.frames + 1, fps=twin.fps), dict(frames=5, fps=0.7 * twin.fps)):
         assert reference_motion.recorded(kept, twin.world(), twin.pokes(), twin.solids(), **timing) is None
 
