@@ -10,10 +10,12 @@ Bodies are filled as the pipeline fills them: a lattice of `spacing` through a c
 of one thread, for the machine is shared.
 """
 
+import contextlib
 import csv
 import importlib.util
 import math
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -239,9 +241,10 @@ def tetrahedra(inside, vertices) -> list[float]:
         mesh.remove_duplicated_vertices().remove_degenerate_triangles()
         v.append(np.asarray(mesh.vertices)), f.append(np.asarray(mesh.triangles) + n)
         n += len(v[-1])
-    points, cells = pytetwild.tetrahedralize(
-        np.concatenate(v), np.concatenate(f).astype(np.int32), edge_length_fac=0.03, optimize=True
-    )[:2]
+    with tempfile.TemporaryDirectory() as notes, contextlib.chdir(notes):  # fTetWild leaves a file where it runs
+        points, cells = pytetwild.tetrahedralize(
+            np.concatenate(v), np.concatenate(f).astype(np.int32), edge_length_fac=0.03, optimize=True
+        )[:2]
     middle = points[cells].mean(1)
     cells = cells[inside(middle) & (middle[:, 2] > SOIL - 0.004)]
     mesh = MeshTet(np.ascontiguousarray(points.T), np.ascontiguousarray(cells.T)).remove_unused_nodes()
