@@ -194,8 +194,8 @@ BODIES = {
     "beam": beams,
     "turned": turned,
     "plate": lambda: boxes("clamped plate 120 x 60 x 6 mm", (0.12, 0.06, 0.006), whole, (20, 10, 1)),
-    "L": lambda: boxes("L-shape, arms of 96 mm, 12 mm square", (0.096, 0.012, 0.096), angle, (24, 3, 24)),
-    "Y": lambda: boxes("Y-shape of 96 mm, 12 mm square", (0.096, 0.084, 0.012), fork, (24, 21, 3)),
+    "L": lambda: boxes("L-shape, arms of 96 mm, 12 mm square", (0.096, 0.012, 0.096), angle, (16, 2, 16)),
+    "Y": lambda: boxes("Y-shape of 96 mm, 12 mm square", (0.096, 0.084, 0.012), fork, (16, 14, 2)),
     "plant": plants,
 }
 
