@@ -37,6 +37,7 @@ from physics3d.learning.interval import Beyond, intervals, is_stiff, posterior, 
 from physics3d.learning.linear import Shown, shown
 from physics3d.learning.loss import Chain
 from physics3d.learning.polish import polish
+from physics3d.learning.rivals import widened
 from physics3d.learning.search import search
 from physics3d.learning.stiffness_field import WIDTH, StiffnessField, asked_for, is_node, picture, trilinear
 from physics3d.learning.unknown_cause import learned_free
@@ -199,7 +200,7 @@ class Learn:
             parameters={name: v.detach().to(torch.float32) for name, v in field.parameters(theta).items()},
             velocity=field.velocity(theta).detach().to(torch.float32),
             history=known,
-            intervals=self.intervals(field, theta, seen, beyond, log) if seen else {},
+            intervals=self.intervals(field, theta, seen, course, beyond, log) if seen else {},
         )
         self.report(capture, field, learned, seen, log)
         if log.folder is not None:
@@ -281,9 +282,9 @@ class Learn:
         return search(chain, field, directions, offsets, seed=self.seed, log=log)
 
     def intervals(
-        self, field: AbstractField, theta: Tensor, seen: Shown, beyond: Beyond, log: Log
+        self, field: AbstractField, theta: Tensor, seen: Shown, course: list[Point], beyond: Beyond, log: Log
     ) -> dict[str, Interval]:
-        """Of every learned number; `beyond`: what pictures do not show."""
+        """Of every learned number; `course`: what was tried; `beyond`: what pictures do not show."""
         unit = field.velocity_scale or 1.0
         speed = [float(v) / unit for v in field.velocity(theta)] if field.velocity_scale else []
         stiff = np.array([float(is_stiff(name)) for name in field.names])
@@ -296,7 +297,7 @@ class Learn:
             beyond=beyond.covariance(stiff, fast, seen.push),
             log=log,
         )
-        return intervals(field, after)
+        return intervals(field, widened(after, course, seen.evidence, log))
 
     def width(self, name: str) -> float:
         """Of what is thought of a component of theta before the clip."""

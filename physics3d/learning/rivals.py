@@ -1,0 +1,71 @@
+"""Rivals: what was tried, and explains the clip about as well as what was learned.
+
+An interval from derivatives at the answer knows one valley of the loss. A thing that swings five times in a clip of a
+few frames has a valley for every number of swings that fits between them, and where the model draws the thing badly
+none of them is deep. With n independent looks at residuals of unknown size, and losses L,
+
+    n ln(L_tried/L_found) < chi^2_1(0.9)        the tried one lies within the 90 % that a likelihood ratio leaves
+
+(Wilks 1938, the variance profiled out). A rival outside the local interval is another valley; it stands for all that is
+nearer to it than to what else was tried, and intervals reach as far as that. (A search whose steps skip whole valleys
+may have skipped the best: where swings are aliased 90 % hold 75 % of the truths, and without rivals 3 %.)
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy import stats
+
+from physics3d.learning.course import Point
+from physics3d.learning.interval import Posterior
+from physics3d.learning.sandwich import CERTAIN, NORMAL, Evidence, spread
+from physics3d.log import Log
+
+BOUND = float(stats.chi2.ppf(CERTAIN, 1))
+
+
+def rivals(course: Sequence[Point], evidence: Evidence) -> list[Point]:
+    """Points of the search that do as well as the last of the course, as far as the independent places and times of the
+    evidence tell. Their losses, and the last one, are over all that was filmed."""
+    tried = [point for point in course if point.way == "search"]
+    if not tried:
+        return []
+    known = spread(evidence)
+    looks = known.places * known.times
+    least = max(min(point.loss for point in (*tried, course[-1])), 1e-300)
+    return [point for point in tried if looks * math.log(max(point.loss, 1e-300) / least) < BOUND]
+
+
+def widened(found: Posterior, course: Sequence[Point], evidence: Evidence, log: Log) -> Posterior:
+    """`found`, its 90 % reaching as far as rivals do, or as what was thought before the clip."""
+    deviation = np.sqrt(found.covariance.diagonal())
+    low, high = found.mean - NORMAL * deviation, found.mean + NORMAL * deviation
+
+    def padded(point: Point) -> np.ndarray:  # components that the search does not know stay where they were
+        theta = point.theta.detach().numpy()
+        return np.concatenate([theta, np.zeros(len(low) - len(theta))])
+
+    tried = np.array([padded(point) for point in course if point.way == "search"]).reshape(-1, len(low))
+    tried = np.unique(tried, axis=0)
+    varied = np.ptp(tried, axis=0) > 0 if len(tried) else np.zeros(len(low), bool)
+    others = [padded(point) for point in rivals(course, evidence)]
+    others = [other for other in others if ((other < low) | (other > high))[varied].any()]
+    if not others:
+        return found
+    distance = np.linalg.norm(tried[:, None] - tried[None], axis=2)
+    half = np.abs(tried[np.where(distance > 0, distance, np.inf).argmin(1)] - tried) / 2  # to the next that was tried
+    mine = [int(np.linalg.norm(tried - other, axis=1).argmin()) for other in others]
+    reach = np.stack([side * half[i] + other for i, other in zip(mine, others) for side in (-1, 1)])
+    reach = reach.clip(-NORMAL * found.before, NORMAL * found.before)
+    lower = np.where(varied, np.minimum(low, reach.min(0)), low)
+    upper = np.where(varied, np.maximum(high, reach.max(0)), high)
+    factor = (upper - lower) / (high - low)
+    if (factor < 1.01).all():
+        return found
+    log.warn(
+        f"{len(others)} of the stiffnesses that the search tried explain the clip as well as the one that was learned; "
+        "the intervals reach as far: record for longer, more frames, or another push"
+    )
+    return replace(found, mean=(lower + upper) / 2, covariance=found.covariance * factor[:, None] * factor)

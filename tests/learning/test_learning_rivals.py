@@ -1,0 +1,72 @@
+"""Laws of rivals: an interval holds every stiffness that the clip does not tell from the one that was learned."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from physics3d.learning.course import Point
+from physics3d.learning.interval import Posterior
+from physics3d.learning.rivals import widened
+from physics3d.learning.sandwich import NORMAL, Evidence
+from physics3d.log import Log
+
+STEP = math.log(4)
+
+
+def aliased(frames: int, noise: float, swings: float, generator: np.random.Generator):
+    """(course, evidence, found) of a thing that swings `swings` times, ln of its stiffness theta from the truth, filmed
+    in so many frames whose pixels, 40 of them, err independently. Search by a factor 4, then the best of a valley."""
+    t = np.linspace(0, 1, frames)[1:, None]
+    gain = generator.normal(size=(1, 40))
+    model = lambda theta: gain * np.sin(2 * np.pi * swings * math.exp(theta / 2) * t)
+    seen = model(0.0) + noise * generator.normal(size=(frames - 1, 40))
+    loss = lambda theta: float(np.mean((model(theta) - seen) ** 2))
+    truth = generator.uniform(-1, 1)  # where the start is, that theta counts from
+    tried = [STEP * k - truth for k in (-1, 0, 1)]
+    best = min(tried, key=loss)
+    best = min(best + np.linspace(-0.1, 0.1, 41), key=loss)
+    J = (model(best + 1e-5) - model(best - 1e-5)) / 2e-5
+    score = (J * (model(best) - seen))[:, :, None]
+    evidence = Evidence(JJ=np.array([[float((J**2).sum())]]), score=score, share=(J**2)[:, :, None])
+    point = lambda way, theta: Point(way=way, theta=torch.tensor([theta + truth]), loss=loss(theta))
+    course = [*(point("search", theta) for theta in tried), point("polish", best)]
+    width = noise / math.sqrt(float((J**2).sum()))
+    found = Posterior(mean=np.array([best + truth]), covariance=np.array([[width**2]]), before=np.array([2.0]))
+    return course, evidence, found, truth
+
+
+def held(found: Posterior, truth: float) -> bool:
+    return bool(abs(found.mean[0] - truth) <= NORMAL * math.sqrt(found.covariance[0, 0]))
+
+
+def test_the_truth_is_held_where_swings_are_aliased():
+    """Five swings in six frames, and a search by factors of 4 that may skip the best valley: two truths in three are
+    held at least, where the local interval holds one in many."""
+    generator = np.random.default_rng(0)
+    alone = together = 0
+    for _ in range(60):
+        course, evidence, found, truth = aliased(6, 3.0, 5.0, generator)
+        alone += held(found, truth)
+        together += held(widened(found, course, evidence, Log(None)), truth)
+    assert alone < 10 and together >= 40  # of 60
+
+
+def test_a_clear_clip_keeps_its_interval():
+    """Half a swing in thirty frames with little noise: nothing else that was tried comes near."""
+    course, evidence, found, _ = aliased(30, 0.02, 0.5, np.random.default_rng(1))
+    assert widened(found, course, evidence, Log(None)) == found
+
+
+def test_intervals_do_not_reach_beyond_what_was_thought_before(tmp_path):
+    """Two stiffnesses that do as well, far from each other; a second parameter that the search leaves alone."""
+    found = Posterior(mean=np.array([-3.0, 0.0]), covariance=0.01 * np.eye(2), before=np.array([0.5, 1.0]))
+    ways = ((-3.0, "search"), (0.0, "search"), (3.0, "search"), (-3.0, "descent"))
+    course = [Point(way=way, theta=torch.tensor([theta, 0.0]), loss=1.0) for theta, way in ways]
+    even = Evidence(JJ=np.eye(2), score=np.ones((4, 4, 2)), share=np.ones((4, 4, 2)))
+    wide = widened(found, course, even, Log(tmp_path, quiet=True))
+    reach = NORMAL * np.sqrt(wide.covariance.diagonal())
+    assert wide.mean[0] + reach[0] == pytest.approx(NORMAL * 0.5)
+    assert [wide.mean[1], reach[1]] == pytest.approx([0.0, NORMAL * 0.1])
+    assert "as well as the one that was learned" in (tmp_path / "log.txt").read_text()
