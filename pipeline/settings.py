@@ -1,6 +1,7 @@
 """Words of the command line -> one plain configuration, by Hydra; every mistake is one line that names the remedy."""
 
 import re
+from functools import cache
 from pathlib import Path
 from typing import Any, cast
 
@@ -25,20 +26,29 @@ def choices(group: str) -> list[str]:
 
 def compose(words: list[str]) -> tuple[dict[str, Any], dict[str, str]]:
     """Overrides such as scene=carnation learn.steps=50 -> (configuration, group -> choice). Raises SettingsError."""
-    from hydra import compose, initialize_config_dir
-    from hydra.core.global_hydra import GlobalHydra
+    composed, written, picked = before_checks(words)
+    wrong = problem(composed, written)
+    if wrong:
+        raise SettingsError(wrong)
+    return composed, picked
+
+
+def before_checks(words: list[str]) -> tuple[dict[str, Any], dict[str, Any], dict[str, str]]:
+    """Overrides -> (configuration, the same before interpolation, group -> choice), whatever its values are.
+
+    Raises SettingsError where there is no such entry or choice.
+    """
+    from hydra import compose
     from hydra.errors import HydraException
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
     for word in words:
         _check_word(word)
-    GlobalHydra.instance().clear()
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        groups = [w for w in words if w.split("=")[0] in GROUPS]
-        if len(groups) < len(words):  # what the other words may name depends on what the groups bring
-            known = cast(dict[str, Any], OmegaConf.to_container(compose("config", groups), resolve=False))
-            words = [w if w in groups else _known_or_new(w, known) for w in words]
+    groups = [w for w in words if w.split("=")[0] in GROUPS]
+    if len(groups) < len(words):  # what the other words may name depends on what the groups bring
+        words = [w if w in groups else _known_or_new(w, _known(tuple(groups))) for w in words]
+    with _hydra():
         try:
             config = compose("config", words, return_hydra_config=True)
             picked = {g: config.hydra.runtime.choices[g] for g in GROUPS if g in config.hydra.runtime.choices}
@@ -46,18 +56,33 @@ def compose(words: list[str]) -> tuple[dict[str, Any], dict[str, str]]:
             del config["hydra"]
             _of_the_material(config, picked, words)
             _by_the_handbook(config, picked)
-            written = OmegaConf.to_container(config, resolve=False)
-            composed = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))
+            written = cast(dict[str, Any], OmegaConf.to_container(config, resolve=False))
+            return cast(dict[str, Any], OmegaConf.to_container(config, resolve=True)), written, picked
         except (HydraException, OmegaConfBaseException) as error:
             gone = re.search(r"(?:Interpolation key '|Error trying to access )([\w.]+)", str(error))
             line = str(error).strip().splitlines()[0]
             raise SettingsError(
                 f"{gone[1]} is not there, but others are taken from it; keep it" if gone else line
             ) from error
-    wrong = problem(composed, cast(dict[str, Any], written))
-    if wrong:
-        raise SettingsError(wrong)
-    return composed, picked
+
+
+@cache  # runs of a sweep differ in seeds and numbers more often than in groups
+def _known(groups: tuple[str, ...]) -> dict[str, Any]:
+    """What the groups bring, before interpolation; to be read only."""
+    from hydra import compose
+    from omegaconf import OmegaConf
+
+    with _hydra():
+        return cast(dict[str, Any], OmegaConf.to_container(compose("config", list(groups)), resolve=False))
+
+
+def _hydra() -> Any:
+    """Hydra, begun anew in the folder of configurations, as a context."""
+    from hydra import initialize_config_dir
+    from hydra.core.global_hydra import GlobalHydra
+
+    GlobalHydra.instance().clear()
+    return initialize_config_dir(str(CONF), version_base="1.3")
 
 
 def _of_the_material(config: Any, picked: dict[str, str], words: list[str]) -> None:

@@ -190,8 +190,10 @@ def test_falling_bar_meets_separating_ground_at_its_plane_and_leaves_after_the_t
     assert float(momentum[-1]) > 0.8 * 0.5 * 1000 * 0.1 * 0.1 * 0.4
 
 
-@pytest.mark.parametrize("scheme", ["explicit", "implicit"])
-@pytest.mark.parametrize("plane", [0.0, 0.45, 0.9])
+# both schemes have the same boundaries and nodes: one plane between nodes tells whether the implicit one obeys them
+@pytest.mark.parametrize(
+    ("plane", "scheme"), [(0.0, "explicit"), (0.45, "explicit"), (0.9, "explicit"), (0.45, "implicit")]
+)
 def test_column_comes_to_rest_with_its_lower_face_on_separating_ground(plane, scheme):
     lower, upper, trajectory = dropped(
         plane, gap=0.3, speed=0.0, seconds=1.0, frames=11, gravity=FALL, damping=20.0, scheme=scheme

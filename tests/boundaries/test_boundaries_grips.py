@@ -1,6 +1,7 @@
 """What is gripped moves as imposed, and the rest of the body feels it where it is: against closed forms."""
 
 import math
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -78,6 +79,7 @@ def test_a_grip_bears_what_hangs_on_it():
         assert float(stress[inside].mean()) == pytest.approx(9810 * (cell + 0.5) * DX, rel=0.06, abs=0.1 * DX * 9810)
 
 
+@cache
 def timoshenko(E: float, density: float, thickness: float, length: float, count: int = 300) -> float:
     """First angular frequency of a clamped beam of rectangular section without Poisson's effect, by finite elements."""
     le, area, inertia = length / count, thickness, thickness**3 / 12

@@ -1,5 +1,7 @@
 """Laws of attachment: a body is held where it touches what is static, and there only."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 import torch
@@ -18,13 +20,9 @@ from stages.fill import Fill
 from stages.simulate import Simulate
 
 
-@pytest.fixture
-def rng():
-    return np.random.default_rng(0)
-
-
-def stem_on_a_plate(rng, *, speck=False):
+def stem_on_a_plate(*, speck=False):
     """A stem, 3 cm thick and 14 cm tall, on a static plate: Gaussians, labels. `speck`: some of its top is static."""
+    rng = np.random.default_rng(0)
     side, top = wall(7000, 0.015, 0, 0.14, rng), annulus(800, 0, 0.015, 0.14, rng)
     stem = discs(*together(side, top), rng)
     plate = discs(*annulus(6000, 0.013, 0.12, 0, rng), rng, sigma=0.003)  # seen up to a little under the rim
@@ -34,11 +32,18 @@ def stem_on_a_plate(rng, *, speck=False):
     return joined(stem, plate), label
 
 
+@cache
+def held_stem(speck: bool = False):
+    """What is filled of it and held."""
+    gaussians, label = stem_on_a_plate(speck=speck)
+    return filled(gaussians, label=label, attach=True)
+
+
 @pytest.mark.parametrize("speck", [False, True])
-def test_a_body_is_held_where_it_touches_what_is_static(speck, rng):
+def test_a_body_is_held_where_it_touches_what_is_static(speck):
     """... and by nothing else: not by a few Gaussians of its own that the segmentation took for static."""
-    gaussians, label = stem_on_a_plate(rng, speck=speck)
-    body = filled(gaussians, label=label, attach=True)
+    gaussians, label = stem_on_a_plate(speck=speck)
+    body = held_stem(speck)
     at = body.position[body.attached]
     assert len(at) >= 8
     assert float(at[:, 2].max()) < SPACING
@@ -47,9 +52,8 @@ def test_a_body_is_held_where_it_touches_what_is_static(speck, rng):
     assert not bool(alone.attached.any()) and alone.held == ()
 
 
-def test_held_particles_do_what_a_box_written_by_hand_does(rng):
-    gaussians, label = stem_on_a_plate(rng)
-    body = filled(gaussians, label=label, attach=True)
+def test_held_particles_do_what_a_box_written_by_hand_does():
+    body = held_stem()
     (found,) = body.held
     top = float(found.position[:, 2].max()) + SPACING / 2  # of the cells of what is held
     box = FixedRegion(lower=(-1, -1, -1), upper=(1, 1, top))
@@ -72,15 +76,22 @@ def test_held_particles_do_what_a_box_written_by_hand_does(rng):
     assert float((moved[2] - moved[1]).norm() / by_hand) > 1
 
 
-@pytest.mark.parametrize("attach", ["auto", "none"])
-@pytest.mark.parametrize("elsewhere", [False, True])
-def test_what_fill_says_is_held_is_what_does_not_move(attach, elsewhere, rng, tmp_path):
-    """... through the stages, whatever else the scene holds: a region beside the body changes nothing."""
-    gaussians, label = stem_on_a_plate(rng)
+@pytest.fixture(scope="module", params=["auto", "none"])
+def through_fill(request, tmp_path_factory):
+    """How fill was told to attach, the body that it made of the stem, and what it said."""
+    gaussians, label = stem_on_a_plate()
     capture = Capture(name="stem", images=(), cameras=(), names=(), gaussians=gaussians)
     segmentation = Segmentation(label=label, parts=("stem",), masks=None, mask_views=())
-    log = Log(tmp_path / "fill", quiet=True)
-    body = Fill(spacing=SPACING, attach=attach)(capture, gaussians, segmentation, log=log)
+    folder = tmp_path_factory.mktemp("fill")
+    log = Log(folder, quiet=True)
+    body = Fill(spacing=SPACING, attach=request.param)(capture, gaussians, segmentation, log=log)
+    return request.param, body, (folder / "log.txt").read_text()
+
+
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_what_fill_says_is_held_is_what_does_not_move(through_fill, elsewhere, tmp_path):
+    """... through the stages, whatever else the scene holds: a region beside the body changes nothing."""
+    attach, body, said_by_fill = through_fill
     region = FixedRegion(lower=(0.5, 0.5, 0.5), upper=(0.6, 0.6, 0.6))
     world = World(
         material=NeoHookean(),
@@ -92,9 +103,9 @@ def test_what_fill_says_is_held_is_what_does_not_move(attach, elsewhere, rng, tm
     )
     poke = Impulse(force=(0.06, 0.03, 0), centre=(0, 0, 0.13), radius=0.03, duration=0.1)
     stage = Simulate(world=world, frames=6, fps=25.0, excitation=(poke,))
-    run = stage(body, world.estimate(), log=Log(tmp_path / "simulate", quiet=True))
+    run = stage(body, world.estimate(), log=Log(tmp_path, quiet=True))
     moved = (run.position[-1] - run.position[0]).norm(dim=1)
-    said = [(tmp_path / name / "log.txt").read_text() for name in ("fill", "simulate")]
+    said = [said_by_fill, (tmp_path / "log.txt").read_text()]
     if attach == "none":
         assert body.attached is None and "attached at" not in said[0] and "nothing holds the body still" in said[1]
         assert float(moved.min()) > 1e-3

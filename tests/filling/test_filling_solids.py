@@ -1,5 +1,7 @@
 """Laws of the inside, on closed bodies whose volume is known."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from analytic_bodies import annulus, box, cup, discs, sphere, together, torus, wall
@@ -59,6 +61,14 @@ def rng():
     return np.random.default_rng(0)
 
 
+@cache
+def ball():
+    """The sphere of `CLOSED`, and what is filled of it."""
+    rng = np.random.default_rng(0)
+    gaussians = discs(*CLOSED["sphere"][0](rng), rng)
+    return gaussians, filled(gaussians)
+
+
 @pytest.mark.parametrize(("solid", "spacing"), SOLIDS, ids=["Poisson", "WindingNumber"])
 @pytest.mark.parametrize("name", CLOSED)
 def test_closed_bodies_are_filled_and_volumes_add_up(name, solid, spacing, rng):
@@ -105,17 +115,17 @@ def test_a_cup_stays_open(rng):
     assert float(body.volume.double().sum()) == pytest.approx(volume, rel=0.03)
 
 
-def test_particles_keep_their_distance(rng):
-    q = filled(discs(*sphere(8000, 0.05, rng), rng)).position.double().numpy()
+def test_particles_keep_their_distance():
+    q = ball()[1].position.double().numpy()
     distance = cKDTree(q).query(q, k=2)[0][:, 1]
     # the lattice inside is exact; cells on the boundary have their centroid moved by up to three eighths of the spacing
     assert np.median(distance) == pytest.approx(SPACING, rel=0.01)
     assert distance.min() > 0.3 * SPACING
 
 
-def test_without_interior_a_shell_remains(rng):
-    gaussians = discs(*sphere(8000, 0.05, rng), rng)
-    shell, whole = filled(gaussians, interior=False), filled(gaussians)
+def test_without_interior_a_shell_remains():
+    gaussians, whole = ball()
+    shell = filled(gaussians, interior=False)
     assert not bool(shell.interior.any())
     assert len(shell.position) == int((~whole.interior).sum())
     assert float(shell.position.norm(dim=1).min()) > 0.05 - 2.5 * SPACING

@@ -42,8 +42,9 @@ def shaken(n: int, speed: float) -> torch.Tensor:
     return speed * torch.randn(n, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
 
 
-@pytest.mark.parametrize("precision", ["float32", "float64"])
-@pytest.mark.parametrize("material", [NeoHookean(), Viscoelastic(branches=0)], ids=repr)
+@pytest.mark.parametrize(
+    ("material", "precision"), [(NeoHookean(), "float64"), (Viscoelastic(branches=0), "float32")], ids=repr
+)
 def test_twenty_times_the_explicit_limit_holds_with_bounded_energy(material, precision):
     position, volume = block((4, 2, 2), DX)
     start = dict(youngs_modulus=1e6, poissons_ratio=0.4)

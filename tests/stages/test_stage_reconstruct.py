@@ -61,10 +61,17 @@ def curve(folder, name: str) -> list[float]:
     return [line["value"] for line in lines if line["name"] == name and line["step"] is not None]
 
 
-@pytest.mark.parametrize("matte", [True, False], ids=["matte", "no matte"])
-@pytest.mark.parametrize("points", [True, False], ids=["points", "no points"])
-@pytest.mark.parametrize("way", WAYS)
-def test_fitting_brings_photographs_never_seen_near(tmp_path, way, matte, points):
+# every two of the three choices meet in each of their ways
+@pytest.mark.parametrize(
+    ("way", "points", "matte"),
+    [
+        ("adaptive", True, True),
+        ("adaptive", False, False),
+        ("relocation", True, False),
+        ("relocation", False, True),
+    ],
+)
+def test_fitting_brings_photographs_never_seen_near(tmp_path, way, points, matte):
     """An empty picture scores about 13 dB here; 150 iterations must bring more than 10 dB on held-out photographs."""
     capture = make_capture(matte=matte, points=points)
     white = torch.stack([capture.images[i].float() / 255 for i in capture.held_out])
