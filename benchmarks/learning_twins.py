@@ -43,11 +43,11 @@ from physics3d.solver import motion_of
 from physics3d.world import World
 
 DENSITY = 0.1  # deviation of the logarithm of the density as given
-NOISE = 4.0 / 255  # deviation of a pixel
+NOISE = 2.0 / 255  # deviation of a pixel
 SIDE = (80, 60)  # of the pictures [px]
 EVERY = 2  # so many frames of the scene's takes are one
-PARTICLES = 1000  # about so many are learned with, where the scene's spacing would give more
-COUNT = 1500  # Gaussians
+PARTICLES = 700  # about so many are learned with, where the scene's spacing would give more
+COUNT = 1200  # Gaussians
 BACKGROUND = (0.80, 0.83, 0.86)
 LIGHT = np.array([-0.39, -0.52, 0.74])  # direction to it
 FINER = 0.8  # spacing of the particles that move the truth, of those that learn
