@@ -5,13 +5,13 @@ A run is a scene of `conf/scene`, a number of cameras and a seed; these draw, ea
     s = 10^U(-1, 1)      stiffness: E = s E_0, branches likewise             q = e^U(-0.5, 0.5)  strength of the branch
     r = e^U(-0.7, 0.7)   relaxation time: tau = r tau_0/sqrt(s)              a, b = U(0.9, 1.15) width and height
     starts               E and branches 10 times too stiff or too soft, the relaxation time 5 times too long or short
-    density              as given, wrong by a log-normal of `DENSITY`        `NOISE` on every pixel, then 8 bits
+    density              as given, wrong by e^N(0, 0.1)      noise of 2/255 on every pixel, then 8 bits
 
 A body s times as stiff is pushed s a^3 times as hard for 1/sqrt(s) of the time and filmed at sqrt(s) times the rate,
 so that every clip shows about as many swings. The carnation moves as finite elements have found
 (`reference_motion.py`): its shape, q and r are those of the scene, and s is a change of units, in which that motion
-stays exact. The others are moved by the modes, of particles of the solids themselves, at `FINER` of the spacing of
-those that filling puts into the Gaussians.
+stays exact. The others are moved by the modes, of particles of the solids themselves, at 0.8 of the spacing of those
+that filling puts into the Gaussians.
 """
 
 import math
