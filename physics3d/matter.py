@@ -2,11 +2,12 @@
 
     V = int dX,   X_c = 1/V int X dX,   S = 1/V int (X - X_c) (X - X_c)^T dX        [m^3], [m], [m^2]
 
-A piece is what one lattice cell holds of the body, or a particle: a cube of its volume, unless something better is
-known. It is integrated as the cuboid of this volume, centroid and second moment, exactly to the fifth degree at 14
-points (Irons 1971), so that a part thinner than a cell bends as it should. (Its midpoint alone would lose 1/n^2 of the
-second moment of a section n pieces across; eight points do not see how a section one piece across can warp.) Two pieces
-are linked where matter of one touches matter of the other: what lies across a gap is not.
+A piece is what one lattice cell, or an eighth of it, holds of the body, or a particle: a cube of its volume, unless
+something better is known. It is integrated as the cuboid of this volume, centroid and second moment, exactly to the
+fifth degree at 14 points (Irons 1971), so that a part thinner than a cell bends as it should. (Its midpoint alone would
+lose 1/n^2 of the second moment of a section n pieces across; eight points, to the third degree, do not see how one
+piece across can warp, and are enough where a particle has several pieces.) Two pieces are linked where matter of
+one touches matter of the other: what lies across a gap is not.
 """
 
 from dataclasses import dataclass, replace
@@ -48,6 +49,12 @@ class Matter(AbstractArtifact):
         """Edge of the cube that a typical piece is [m]: of the largest tenth, for those of a surface are cut."""
         return float(torch.quantile(self.volume, 0.9)) ** (1 / 3)
 
+    @property
+    def spacing(self) -> float:
+        """The same of the particles [m], which may own several pieces."""
+        owned = torch.zeros(int(self.owner.max()) + 1, dtype=self.volume.dtype).index_add_(0, self.owner, self.volume)
+        return float(torch.quantile(owned[owned > 0], 0.9)) ** (1 / 3)
+
     def select(self, chosen: np.ndarray) -> "Matter":
         """The pieces of a mask [m], and the links among them."""
         number = np.cumsum(chosen) - 1
@@ -81,15 +88,21 @@ def of_samples(
     owner: Int[np.ndarray, " m"],
 ) -> Matter:
     """Pieces of lattice cells of edge h [m], from samples: cell i begins at origin + h cell_i; `inside` [m, s] says
-    which of its samples, at `offset` in the unit cell, are matter. `offset` is a cubic arrangement of n^3, x
-    slowest."""
+    which of its samples, at `offset` in the unit cell, are matter. `offset` has one in each of n^3 equal parts, x
+    slowest. Cells without matter make no piece."""
+    some = inside.any(1)
+    cell, inside, owner = cell[some], inside[some], owner[some]
     n = round(len(offset) ** (1 / 3))
-    count = inside.sum(1)
-    at = origin + h * (cell[:, None] + offset)
-    centroid = np.einsum("cs,csi->ci", inside, at) / count[:, None]
-    away = at - centroid[:, None]
-    moment = np.einsum("cs,csi,csj->cij", inside, away, away) / count[:, None, None]
-    moment += (h / n) ** 2 / 12 * np.eye(3)
+    matter = inside.astype(float)
+    count = matter.sum(1)
+    mean = matter @ offset / count[:, None]
+    square = (offset[:, :, None] * offset[:, None, :]).reshape(-1, 9)
+    moment = (matter @ square / count[:, None]).reshape(-1, 3, 3) - mean[:, :, None] * mean[:, None, :]
+    # a lone sample is a cube of its part; of all together the cell is the cube
+    short = np.eye(3) / 12 - np.cov(offset.T, bias=True)
+    moment += (1 / n**2 / 12 / count)[:, None, None] * np.eye(3) * (count < n**3)[:, None, None]
+    moment += (count / n**3)[:, None, None] * short
+    moment, centroid = h**2 * moment, origin + h * (cell + mean)
     # neighbours share a face on which both have matter
     solid = inside.reshape(-1, n, n, n)
     size = cell.max(0, initial=0) + 2
@@ -113,7 +126,7 @@ def of_samples(
 
 
 def in_one_piece(matter: Matter) -> Matter:
-    """With clusters that no link joins to the rest, but that are nearer than two edges of a piece, linked where they
+    """With clusters that no link joins to the rest, but that are nearer than two particles, linked where they
     are nearest: slivers that the sampling cut off, particles that lie loosely. (Filling calls what is farther a piece
     of its own.)"""
     x = matter.position.numpy()
@@ -125,7 +138,7 @@ def in_one_piece(matter: Matter) -> Matter:
             return matter
         largest = np.bincount(cluster, weights=matter.volume.numpy()).argmax()
         main, rest = np.flatnonzero(cluster == largest), np.flatnonzero(cluster != largest)
-        distance, near = cKDTree(x[main]).query(x[rest], distance_upper_bound=2 * matter.size)
+        distance, near = cKDTree(x[main]).query(x[rest], distance_upper_bound=2 * matter.spacing)
         order = np.lexsort((distance, cluster[rest]))
         first = order[np.unique(cluster[rest][order], return_index=True)[1]]
         first = first[np.isfinite(distance[first])]
@@ -135,15 +148,45 @@ def in_one_piece(matter: Matter) -> Matter:
         matter = replace(matter, links=torch.from_numpy(np.concatenate([links, more])))
 
 
+def in_blocks(matter: Matter, edge: float) -> tuple[Matter, np.ndarray]:
+    """(What of the body hangs together in every cube of a lattice of this edge [m], as one piece; its number [m] for
+    every piece as it was). Volume, centroid and second moment are exact; the owner is that of the nearest piece."""
+    x, V, S = (t.numpy() for t in (matter.position, matter.volume, matter.moment))
+    links, m = matter.links.numpy(), len(x)
+    cube = np.floor((x - x.min(0)) / edge + 1e-6).astype(np.int64)
+    inner = (cube[links[:, 0]] == cube[links[:, 1]]).all(1)
+    graph = sparse.coo_matrix((np.ones(inner.sum(), bool), links[inner].T), shape=(m, m))
+    count, block = sparse.csgraph.connected_components(graph, directed=False)
+    gather = sparse.csr_matrix((V, (block, np.arange(m))), shape=(count, m))
+    volume = np.asarray(gather.sum(1)).reshape(-1)
+    centroid = gather @ x / volume[:, None]
+    away = x - centroid[block]
+    moment = gather @ (S + away[:, :, None] * away[:, None, :]).reshape(m, 9) / volume[:, None]
+    order = np.lexsort((np.linalg.norm(away, axis=1), block))
+    nearest = order[np.unique(block[order], return_index=True)[1]]
+    between = np.unique(np.sort(block[links[~inner]], 1), axis=0)
+    blocks = Matter(
+        position=torch.from_numpy(centroid),
+        volume=torch.from_numpy(volume),
+        moment=torch.from_numpy(moment.reshape(count, 3, 3)),
+        owner=matter.owner[nearest],
+        links=torch.from_numpy(between[between[:, 0] != between[:, 1]]),
+    )
+    return blocks, block
+
+
 def points(matter: Matter) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(X [n, 3] m, weight [n] m^3, piece [n]): 14 points of every piece."""
+    """(X [n, 3] m, weight [n] m^3, piece [n]): 14 points of every piece, or 8 where particles have several pieces."""
     value, axes = np.linalg.eigh(matter.moment.numpy())
     root = (axes * np.sqrt(np.maximum(value, 0))[:, None]) @ axes.transpose(0, 2, 1)
-    corner = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3, indexing="ij"), -1).reshape(8, 3)
-    place = np.concatenate([np.sqrt(19 / 30) * np.eye(3), -np.sqrt(19 / 30) * np.eye(3), np.sqrt(19 / 33) * corner])
-    share = np.array([320 / 361] * 6 + [121 / 361] * 8) / 8
-    # half an edge is sqrt(3) deviations
-    X = matter.position.numpy()[:, None] + np.einsum("mij,kj->mki", root, np.sqrt(3) * place)
+    corner = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3, indexing="ij"), -1).reshape(8, 3)  # in deviations
+    if matter.spacing > 1.5 * matter.size:
+        place, share = corner, np.full(8, 1 / 8)
+    else:
+        half = np.sqrt(3) * np.sqrt(19 / 30) * np.eye(3)  # an edge is twice sqrt(3) deviations
+        place = np.concatenate([half, -half, np.sqrt(3) * np.sqrt(19 / 33) * corner])
+        share = np.array([320 / 361] * 6 + [121 / 361] * 8) / 8
+    X = matter.position.numpy()[:, None] + np.einsum("mij,kj->mki", root, place)
     weight = matter.volume.numpy()[:, None] * share
     return X.reshape(-1, 3), weight.reshape(-1), np.repeat(np.arange(len(X)), len(share))
 
@@ -152,7 +195,7 @@ def with_particles(
     matter: Matter, position: Float[np.ndarray, "n 3"], volume: Float[np.ndarray, " n"], moment: np.ndarray, first: int
 ) -> Matter:
     """`matter` and n more particles, numbered from `first` on, a piece each, linked by their distance."""
-    edge = matter.size if len(matter.position) else float(np.quantile(volume, 0.9)) ** (1 / 3)
+    edge = matter.spacing if len(matter.position) else float(np.quantile(volume, 0.9)) ** (1 / 3)
     old, m = matter.position.numpy(), len(matter.position)
     pairs = cKDTree(np.concatenate([old, position])).query_pairs(REACH * edge, output_type="ndarray")
     pairs = pairs[(pairs >= m).any(1)].astype(np.int64)

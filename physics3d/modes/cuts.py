@@ -99,7 +99,9 @@ def _between(matter: Matter, keep: Bool[np.ndarray, " m"], pinned: Bool[np.ndarr
     x, S = matter.position.numpy(), matter.moment.numpy()
     normal = x[free] - x[fixed]
     distance = np.linalg.norm(normal, axis=1)
-    near = distance < 1.25 * matter.size  # not along diagonals, unless there is nothing else
+    # not along diagonals, unless there is nothing else
+    edge = np.sqrt(12 * np.linalg.eigvalsh(S)[:, -1])
+    near = distance < 1.25 * np.maximum(edge[free], edge[fixed])
     if near.any():
         free, fixed, normal, distance = free[near], fixed[near], normal[near], distance[near]
     normal = normal / np.maximum(distance, 1e-30)[:, None]

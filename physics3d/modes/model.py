@@ -18,16 +18,18 @@ from torch import Tensor
 from physics3d.boundaries.base import AbstractBoundary, Setting
 from physics3d.log import Log
 from physics3d.materials.base import Values
-from physics3d.matter import Matter, in_one_piece, of_particles, points
+from physics3d.matter import Matter, in_blocks, in_one_piece, of_particles, points
 from physics3d.modes import basis, cubature, lattice, vibration
 from physics3d.modes.conditions import Conditions, Refused, conditions
 from physics3d.modes.dynamics import TOLERANCE, Pull, Spring, System
 from physics3d.modes.stress import Points
 from physics3d.world import World
 
-# spacing of the splines, in edges of a piece: the first with at most MOST_SPLINES of them
-CELL = (1, 1.5, 2, 3, 4, 6, 8)
-MOST_SPLINES = 1500
+# spacing of the splines, in edges of a piece: the first with at most MOST_SPLINES of them. Their knots lie anywhere in
+# the pieces, so that splines as near to each other as these would be integrated too softly
+CELL = (4 / 3, 1.6, 2, 2.5, 3, 4, 6, 8)
+MOST_SPLINES = 2500
+BLOCK = 2.5  # edges of a piece: of splines that far apart, what hangs together in the half of it is integrated as one
 PIN = 1e3  # stiffness of a pin, in that of a cube of the piece behind it
 MODES = 12  # of vibration, whose components are fields of the basis
 QUADRATURE = 300  # points of integration
@@ -126,19 +128,28 @@ def model(
     found = conditions(boundaries, setting, in_one_piece(matter))
     matter = found.matter
     size = matter.size
-    at, weight, piece = points(matter)
     # where the particles are, on the piece of theirs that is nearest
     seat = _seats(x.numpy(), matter)
     free = np.flatnonzero(seat >= 0)
     pins = found.pins
-    places = np.concatenate([at, *(p.position for p in pins), x.numpy()[free]])
-    pieces = np.concatenate([piece, *(p.piece for p in pins), seat[free]])
+    single, block = matter, np.arange(len(matter.position))
     for cell in CELL:
+        if cell >= BLOCK:
+            matter, block = in_blocks(single, cell / 2 * size)
+        at, weight, piece = points(matter)
+        places = np.concatenate([at, *(p.position for p in pins), x.numpy()[free]])
+        pieces = np.concatenate([piece, *(block[p.piece] for p in pins), block[seat[free]]])
         splines = lattice.splines(places, pieces, matter.links.numpy(), len(matter.position), cell * size)
         if splines.count <= MOST_SPLINES:
             break
     N, G = splines.at(at, piece)
     owner = matter.owner.numpy()[piece]
+    share = sparse.csr_matrix((single.volume.numpy(), (block, np.arange(len(block)))))
+    share = sparse.diags(1 / matter.volume.numpy()) @ share  # of every piece in its block
+
+    def at_points(of_particle: np.ndarray) -> np.ndarray:
+        """What particles are given, in the mean over what a point stands for."""
+        return (share @ of_particle[single.owner.numpy()].astype(float))[piece]
 
     of_all = world.material.coefficients({k: torch.as_tensor(v).double() for k, v in parameters.items()})
     coefficients = of_all.detach().cpu().expand(-1, len(x)).numpy()[:, owner]
@@ -152,31 +163,31 @@ def model(
     np.maximum.at(stiff, piece, modulus)
     permanent = sparse.csr_matrix((splines.count, splines.count))
     for p in pins:
-        S, _ = splines.at(p.position, p.piece)
-        permanent = permanent + S.T @ sparse.diags(PIN * stiff[p.piece] / size * p.area) @ S
+        S, _ = splines.at(p.position, block[p.piece])
+        permanent = permanent + S.T @ sparse.diags(PIN * stiff[block[p.piece]] / size * p.area) @ S
     held = permanent.nnz > 0
     springs = [Spring(matrix=permanent)] if held else []
     # functions that hold next to no matter do not make matrices singular
     faint = np.full(splines.count, vibration.FAINT * float(np.median(modulus)) * splines.H)
     for grip in found.grips:
-        mine = grip.particles[owner]
+        mine = at_points(grip.particles)
         if not mine.any():
             raise Refused("a moved or held region has no free matter in it")
-        k = np.where(mine, PIN * modulus * weight / size**2, 0.0)
+        k = mine * PIN * modulus * weight / size**2
         matrix = N.T @ sparse.diags(k) @ N
         first = np.stack([N.T @ k, *(N.T @ (k * (at[:, a] - grip.point[a])) for a in range(3))], 1)
         springs.append(Spring(matrix=matrix.tocsr(), pull=Pull(motion=grip.motion, first=first), until=grip.until))
-    load_weight = np.array([load.weight[owner] for load in found.loads]).reshape(-1, len(owner))
+    load_weight = np.array([at_points(load.weight) for load in found.loads]).reshape(-1, len(owner))
     load_fields = (N.T @ (world.density * weight * load_weight).T).T
     first_moment = N.T @ (world.density * weight)
 
     span = float(np.linalg.norm(np.ptp(at, axis=0)))
-    values, slopes = _at_particles(splines, x.numpy(), seat)
+    values, slopes = _at_particles(splines, x.numpy(), np.where(seat >= 0, block[seat], -1))
     rest = (permanent + sparse.diags(faint)).tocsr()
     shift = _shift(world, modulus, span, held)
     exact, shapes = vibration.modes((K + _three(rest)).tocsr(), M, modes + (0 if held else 6), shift=shift)
     log.info(
-        f"{len(matter.position)} pieces, {splines.count} splines {1e3 * splines.H:.3g} mm apart, {len(weight)} points"
+        f"{len(single.position)} pieces, {splines.count} splines {1e3 * splines.H:.3g} mm apart, {len(weight)} points"
     )
     # Rayleigh's quotients: what was added to keep the matrix regular changes shapes a little, and these not at all
     elastic = K + _three(permanent)
