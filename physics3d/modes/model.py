@@ -88,8 +88,8 @@ class Model:
             tolerance=TOLERANCE[self.world.dtype],
         )
 
-    def modes(self, coefficients: np.ndarray, count: int) -> list[vibration.Mode]:
-        """Frequencies and loss factors of the lowest `count` modes of vibration, their shapes those of this material
+    def modes(self, coefficients: np.ndarray, count: int | None) -> list[vibration.Mode]:
+        """Frequencies and loss factors of the lowest modes of vibration, `count` or all, their shapes those of this material
         with stuck dash-pots."""
         points = Points(self.world.material, coefficients, self.weight)
         stuck = points.tangent(np.zeros((len(self.weight), 3, 3)), vibration.STUCK)

@@ -109,8 +109,9 @@ class Solver:
         found = self.world.material.coefficients({k: torch.as_tensor(v).double().cpu() for k, v in parameters.items()})
         return found.expand(-1, len(self.position))[:, torch.from_numpy(self.model.owner)]
 
-    def modes(self, parameters: Values, count: int = MODES) -> list[Mode]:
-        """The lowest modes of vibration about the undeformed state, rigid motions of a free body left out."""
+    def modes(self, parameters: Values, count: int | None = None) -> list[Mode]:
+        """The lowest modes of vibration about the undeformed state, `count` of them or all that the basis has; rigid
+        motions of a free body are left out."""
         return self.model.modes(self.coefficients(parameters).detach().numpy(), count)
 
     def pushed(self, times: float) -> "Solver":
