@@ -89,8 +89,8 @@ class Model:
         )
 
     def modes(self, coefficients: np.ndarray, count: int | None) -> list[vibration.Mode]:
-        """Frequencies and loss factors of the lowest modes of vibration, `count` or all, their shapes those of this material
-        with stuck dash-pots."""
+        """Frequencies and loss factors of the lowest modes of vibration, `count` of them or all; their shapes are those
+        of this material with stuck dash-pots."""
         points = Points(self.world.material, coefficients, self.weight)
         stuck = points.tangent(np.zeros((len(self.weight), 3, 3)), vibration.STUCK)
         held_by = sum((np.kron(s.matrix, np.eye(3)) for s in self.springs if s.pull is None), 0 * self.stiffness)
