@@ -101,9 +101,9 @@ def main(words: list[str]) -> None:
                 row = {name: "" for name in COLUMNS} | one.result()
                 rows.append({name: f"{v:.5g}" if isinstance(v, float) else str(v) for name, v in row.items()})
                 keep(table, rows)
-                write(sorted(rows, key=place), RESULTS)
+                write(sorted(rows, key=place), RESULTS, len(every))
                 log.info(", ".join(f"{name} {rows[-1][name]}" for name in COLUMNS if rows[-1][name]))
-    write(sorted(rows, key=place), RESULTS)
+    write(sorted(rows, key=place), RESULTS, len(every))
 
 
 def runs(options: dict[str, str]) -> Iterator[Run]:

@@ -42,8 +42,8 @@ taken away: density and push are 10 % wrong, and are known to be uncertain by as
 """
 
 
-def write(rows: list[Row], folder: Path) -> None:
-    """`learning.md` and `learning.png`, of the rows of `learning.csv`."""
+def write(rows: list[Row], folder: Path, total: int) -> None:
+    """`learning.md` and `learning.png`, of the rows of `learning.csv`; `total` runs were asked for."""
     done = [row for row in rows if not row["failed"]]
     runs = [row for row in done if not row["taken"]]
     failed = [row for row in rows if row["failed"]]
@@ -54,6 +54,8 @@ def write(rows: list[Row], folder: Path) -> None:
         f"Machine: {machine('cpu')}.",
         "",
     ]
+    if len(rows) < total:
+        lines += [f"**{len(rows)} of {total} runs are done**; `make bench-learning` goes on with the others.", ""]
     lines += [*about().splitlines(), "", "## In words", *WORDS.format(ceiling=ceiling()).splitlines(), ""]
     lines += ["## What must hold", "", "| what | measured | bar | holds |", "|---|---|---|---|"]
     lines += [f"| {' | '.join(law)} |" for law in bars(runs, failed)]
