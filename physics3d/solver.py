@@ -57,7 +57,7 @@ class Motion:
         """Say how the body vibrates with these parameters, if it is moved by its modes."""
         if self.modes is None:
             return
-        found = self.modes.modes(parameters)[:3]
+        found = self.modes.modes(parameters, 3)
         self.log.info(f"first {len(found)} frequencies: {', '.join(str(mode) for mode in found)} Hz")
         for number, mode in enumerate(found, 1):
             self.log.metric(f"frequency/{number}", mode.frequency)

@@ -76,14 +76,11 @@ def chain_of(
         return motion(part(field.parameters(theta)), velocity=field.velocity(theta), **timing)
 
     def pushed(theta: Tensor, more: float):
-        stronger = motion_of(
-            replace(world, boundaries=_stronger(world.boundaries, more)),
-            rest,
-            volume,
+        stronger = replace(
+            motion,
+            world=replace(world, boundaries=_stronger(world.boundaries, more)),
             excitation=(*body.held, *_stronger(take.excitation or (), more)),
-            part=part,
-            matter=body.matter,
-            device=device,
+            modes=None if motion.modes is None else motion.modes.pushed(math.exp(more)),
             log=Log(None),
         )
         timing = dict(frames=at[-1] + 1, frame_dt=step / take.fps, log=Log(None))

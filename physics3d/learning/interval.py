@@ -14,6 +14,7 @@ in newtons (0 where what drives the motion is a known motion, an acceleration, o
     density          e = 1_m + phi: E goes with rho exactly, except for a known force. One that holds a thing bent says
                      E whatever it weighs (phi = -1); one that makes it swing says both
     length           e = 2 1_m + 4 phi: E goes with rho L^2; and velocities with L
+    force            e = phi: a thing that was pushed harder than is said seems softer
 
 phi is exact where all that is stiff is learned. theta is ln of a number, of Poisson's ratio ln K/mu, or a velocity in
 its own unit (`fields.py`), so a 90 % interval of the number follows from that of theta.
@@ -58,6 +59,7 @@ class Beyond:
     modes: Width = 0.05
     density: Width = 0.1  # of the density, as given
     length: Width = 0.05  # of the size, as given
+    force: Width = 0.1  # of the forces that are known, as given
 
     def __post_init__(self):
         require_fields(self, "learn.beyond")
@@ -77,6 +79,7 @@ class Beyond:
             (self.grid, stiff),
             (self.density, stiff + push),
             (self.length, 2 * stiff + speed + 4 * push),
+            (self.force, push),
         )
         return sum((width**2 * np.outer(e, e) for width, e in changes), np.zeros((len(stiff),) * 2))
 

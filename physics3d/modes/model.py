@@ -88,9 +88,9 @@ class Model:
             tolerance=TOLERANCE[self.world.dtype],
         )
 
-    def modes(self, coefficients: np.ndarray) -> list[vibration.Mode]:
-        """Frequencies and loss factors of the modes of vibration, their shapes those of this material with stuck
-        dash-pots."""
+    def modes(self, coefficients: np.ndarray, count: int | None) -> list[vibration.Mode]:
+        """Frequencies and loss factors of the lowest modes of vibration, `count` of them or all; their shapes are those
+        of this material with stuck dash-pots."""
         points = Points(self.world.material, coefficients, self.weight)
         stuck = points.tangent(np.zeros((len(self.weight), 3, 3)), vibration.STUCK)
         held_by = sum((np.kron(s.matrix, np.eye(3)) for s in self.springs if s.pull is None), 0 * self.stiffness)
@@ -98,7 +98,7 @@ class Model:
         mass, faint = np.kron(self.mass, np.eye(3)), 1e-6 * self.omega.max() ** 2
         square, found = vibration.dense_modes(whole, mass, len(self.omega), shift=faint)
         swings = square > (RIGID * np.sqrt(square.max())) ** 2
-        shapes = found.T.reshape(len(square), -1, 3)[swings]
+        shapes = found.T.reshape(len(square), -1, 3)[swings][:count]
         strain = np.stack([(self.gradient @ shape).reshape(-1, 3, 3) for shape in shapes])
         kappa = vibration.relaxation(self.world.material, coefficients, self.weight, strain)
         held = np.array([sum(np.vdot(s, k.matrix @ s) for k in self.springs if k.pull is None) for s in shapes])

@@ -14,7 +14,7 @@ history at the points of integration, however many particles there are.
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -109,9 +109,20 @@ class Solver:
         found = self.world.material.coefficients({k: torch.as_tensor(v).double().cpu() for k, v in parameters.items()})
         return found.expand(-1, len(self.position))[:, torch.from_numpy(self.model.owner)]
 
-    def modes(self, parameters: Values) -> list[Mode]:
-        """The lowest modes of vibration about the undeformed state, rigid motions of a free body left out."""
-        return self.model.modes(self.coefficients(parameters).detach().numpy())
+    def modes(self, parameters: Values, count: int | None = None) -> list[Mode]:
+        """The lowest modes of vibration about the undeformed state, `count` of them or all that the basis has; rigid
+        motions of a free body are left out."""
+        return self.model.modes(self.coefficients(parameters).detach().numpy(), count)
+
+    def pushed(self, times: float) -> "Solver":
+        """The same body under known forces so many times as large; accelerations stay. The basis holds its answer to a
+        force whatever its size, so nothing is built anew."""
+        found = self.model.conditions
+        loads = tuple(
+            load if load.boundary.force is None else replace(load, acceleration=times * load.acceleration)
+            for load in found.loads
+        )
+        return replace(self, model=replace(self.model, conditions=replace(found, loads=loads)))
 
     def statics(
         self, parameters: Values, load: AbstractBoundary | None = None, *, gravity: bool = False
