@@ -1,6 +1,7 @@
 """Laws of what cameras see of a body: it is as large as its pictures, wherever a fit has put its Gaussians."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -18,11 +19,26 @@ def rng():
     return np.random.default_rng(0)
 
 
-@pytest.mark.parametrize(("depth", "flat"), [(0.0, 0.0003), (0.003, 0.0005)])
-def test_a_body_is_as_large_as_its_pictures_wherever_its_gaussians_lie(depth, flat, rng):
-    gaussians, cameras = ball(rng, depth, flat), around()
-    truth = radius_in_pictures(gaussians, cameras)
-    volume = float(filled(gaussians, cameras).volume.double().sum())
+PLAIN, DEEP = (0.0, 0.0003), (0.003, 0.0005)  # depth and thickness of the discs of a ball [m]
+
+
+@cache
+def seen_around(depth: float, flat: float):
+    """A ball, the cameras around it, and its radius in their pictures [m]."""
+    gaussians, cameras = ball(np.random.default_rng(0), depth, flat), around()
+    return gaussians, cameras, radius_in_pictures(gaussians, cameras)
+
+
+@cache
+def volume_of(depth: float, flat: float) -> float:
+    """Of what is filled of it [m^3]."""
+    gaussians, cameras, _ = seen_around(depth, flat)
+    return float(filled(gaussians, cameras).volume.double().sum())
+
+
+@pytest.mark.parametrize(("depth", "flat"), [PLAIN, DEEP])
+def test_a_body_is_as_large_as_its_pictures_wherever_its_gaussians_lie(depth, flat):
+    truth, volume = seen_around(depth, flat)[2], volume_of(depth, flat)
     # three quarters of a pixel; by the centres and their thickness it is 1.3 and 1.8 mm
     assert (volume * 3 / (4 * np.pi)) ** (1 / 3) == pytest.approx(truth, abs=1.2e-3)
 
@@ -59,18 +75,17 @@ def test_cameras_that_do_not_see_the_body_are_an_error(rng):
 
 def test_what_hides_a_body_takes_nothing_from_it(rng):
     """A static plate before half of the cameras: they say nothing of what is behind it."""
-    gaussians, cameras = ball(rng, 0.003, 0.0005), around()
+    gaussians, cameras, _ = seen_around(*DEEP)
     side = np.stack([np.full(4000, 0.09), *rng.uniform(-0.15, 0.15, (2, 4000))], 1)
     plate = discs(side, np.tile([1.0, 0.0, 0.0], (4000, 1)), rng, sigma=0.006)
     both = joined(gaussians, plate)
     label = torch.cat([torch.ones(len(gaussians)), torch.zeros(len(plate))]).int()
-    alone, beside = filled(gaussians, cameras), filled(both, cameras, label)
-    assert float(beside.volume.sum()) == pytest.approx(float(alone.volume.sum()), rel=0.02)
+    beside = float(filled(both, cameras, label).volume.double().sum())
+    assert beside == pytest.approx(volume_of(*DEEP), rel=0.02)
 
 
-def test_nothing_is_filled_where_the_cameras_see_past_the_body(rng):
-    gaussians, cameras = ball(rng, 0.0, 0.0003), around()
-    truth = radius_in_pictures(gaussians, cameras)
+def test_nothing_is_filled_where_the_cameras_see_past_the_body():
+    gaussians, cameras, truth = seen_around(*PLAIN)
     body = filled(gaussians, cameras, solid=Round(radius=1.3 * RADIUS))
     # a particle lies at the centroid of its cell; a tenth of the cameras may err
     assert float(body.position.norm(dim=1).max()) < truth + 0.5 * SPACING
@@ -79,8 +94,7 @@ def test_nothing_is_filled_where_the_cameras_see_past_the_body(rng):
 
 def test_distances_are_those_of_the_surface(rng):
     """... to three quarters of a pixel in the mean, and one for most."""
-    gaussians, cameras = ball(rng, 0.0, 0.0003), around()
-    truth = radius_in_pictures(gaussians, cameras)
+    gaussians, cameras, truth = seen_around(*PLAIN)
     box = dict(lower=np.full(3, -0.07), upper=np.full(3, 0.07))
     view = seen(gaussians, torch.ones(len(gaussians)).int(), cameras, **box, spacing=SPACING, log=Log(None))
     assert view.truncation == pytest.approx(0.75 * SPACING)
