@@ -14,6 +14,7 @@ from pathlib import Path
 
 from pipeline.filed import megabytes, one_line
 from pipeline.settings import SettingsError, compose
+from pipeline.stage import build
 
 EDGE, STEPS = 0.010, 6
 
@@ -30,15 +31,13 @@ def write(words: list[str]) -> None:
     except ValueError:
         raise SettingsError(f"{own}: edge is a length in m, steps a whole number") from None
     settings, _ = compose([w for w in words if not w.startswith(("edge=", "steps="))])
-    from hydra.utils import instantiate
-
     from physics3d.log import Log
     from physics3d.scenes import finite_elements, reference_motion
     from physics3d.scenes.carnation import CarnationTwin
     from physics3d.scenes.made import MadeTwin
     from physics3d.scenes.synthetic import particles
 
-    source = instantiate(settings["scene"]["source"])
+    source = build(settings["scene"]["source"], "cpu", "scene.source")
     if not isinstance(source, CarnationTwin | MadeTwin):
         raise ValueError(f"scene.source is a {type(source).__name__}; finite elements are made for twins that are held")
     if any(importlib.util.find_spec(name) is None for name in ("pytetwild", "pyvista")):

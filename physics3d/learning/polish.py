@@ -18,10 +18,12 @@ def polish(
 
         (J^T J + stay L_0 + m max diag J^T J) d = -(J^T (z0 - x0_hat) + stay L_0 theta)
 
-    m grows by 8 on failure and falls by 4 on success. It is the same for all components, so that one which the pictures
-    hardly show moves least. Returns theta and where it was after every step.
+    with L_0 the loss where they begin: the pull to the start is measured by what is left unexplained, not by how bad
+    the start was, else one that is far off holds what the pictures hardly show. m grows by 8 on failure and falls by 4
+    on success. It is the same for all components, so that one which the pictures hardly show moves least. Returns theta
+    and where it was after every step.
     """
-    unit, m = max(chain.measure(field.zero(), seed), 1e-12), 1e-3
+    unit, m = max(chain.measure(theta, seed), 1e-12), 1e-3
     pulled = lambda t: 0.5 * stay * unit * float(t.square().sum())
     total = lambda t: chain.measure(t, seed) + pulled(t)
     now, around, course = total(theta), None, []
