@@ -45,7 +45,6 @@ WORDS = (
     "learn.search_span=16.0",
     "learn.steps=0",
     "learn.polish=8",
-    "learn.stay=1e-4",  # the pull to a start that is far off would outweigh what the clip says of the branch
     "learn.views_per_step=0",
     "learn.image_scale=1.0",
 )
