@@ -35,7 +35,7 @@ def test_the_check_can_be_left_out(unchecked):
         velocity_gradient(x, x[:4], x[:, 0])
 
 
-@pytest.mark.parametrize("name", ["physics3d.mpm.rollout", "physics3d.gaussians.rasterize", "stages.simulate"])
+@pytest.mark.parametrize("name", ["physics3d.mpm.rollout", "physics3d.gaussians.rasterize", "physics3d.matter"])
 def test_public_functions_are_checked(name: str):
     assert name in with_checked_shapes()
     assert any(type(x).__name__ == "_JaxtypingLoader" for x in [importlib.import_module(name).__spec__.loader])

@@ -40,6 +40,7 @@ LIKELY = {"ratio": 0.3, "time": 0.1}  # r, and tau [s]
 PRIOR = 1e-3  # of the motion: what one such width costs
 FIRST, FINER = 250, 1200  # materials that are tried, from each guess, and once with zones
 ASKED = 0.9  # of the unexplained motion: zones have to leave less
+TIE = 1.1  # times the least that a mode leaves unexplained: as good
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -247,14 +248,21 @@ def fit(
     likely = np.argsort(np.where(square > 1e-9 * square.max(), -alone, 0.0), kind="stable")[:GUESSES]
     swings = np.sqrt(square[likely]) / (2 * np.pi)
     tried = log.progress(None, "trying materials, at most", total=FIRST * len(swings) + (FINER if zones > 1 else 0))
-    best: optimize.OptimizeResult | None = None
+    tries: list[tuple[float, optimize.OptimizeResult]] = []
     for guess in swings:
         first = np.array([2 * math.log(frequency / guess), math.log(LIKELY["ratio"]), math.log(LIKELY["time"])])
         found = _descended(lambda x: cost(np.concatenate([x, nothing])), first, FIRST)
         log.info(f"largest oscillation taken for a mode at {guess:.3g} Hz: {100 * found.fun:.1f} % left unexplained")
-        if best is None or found.fun < best.fun:
-            best = found
-    assert best is not None
+        tries.append((float(guess), found))
+    least = min(found.fun for _, found in tries)
+    level = [(guess, found) for guess, found in tries if found.fun <= TIE * least]
+    guess, best = min(level, key=lambda one: one[0])
+    # neighbours of two planes are no other answer
+    if others := sorted(f for f, _ in level if f > 1.5 * guess):
+        log.warn(
+            f"the oscillation may as well be a mode at {others[0]:.3g} Hz of the start, and the thing softer by a "
+            f"factor {(others[0] / guess) ** 2:.3g}; the lowest is taken, for a push moves it most. Another take may tell"
+        )
     theta = np.concatenate([best.x, nothing])
     if zones > 1:
         finer = _descended(cost, theta, FINER)
