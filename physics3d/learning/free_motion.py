@@ -261,7 +261,7 @@ def fit(
     if others := sorted(f for f, _ in level if f > 1.5 * guess):
         log.warn(
             f"the oscillation may as well be a mode at {others[0]:.3g} Hz of the start, and the thing softer by a "
-            f"factor {(others[0] / guess) ** 2:.3g}; the lowest is taken, for pushes move it most. Another take may tell"
+            f"factor {(others[0] / guess) ** 2:.3g}; the lowest is taken, which pushes move most. Another take may tell"
         )
     theta = np.concatenate([best.x, nothing])
     if zones > 1:
