@@ -97,7 +97,10 @@ class Arrays:
         self.window: wp.array = self.zeros(6, wp.int32)  # lowest node and number of nodes along each axis
         self.node_count: int = 0  # in the window
         self.capacity: int = 0  # nodes that the grid has room for; another one: the arrays below are others
-        self.grid: wp.array = self.zeros((self.workers, 0), vector4(self.real))  # momentum [kg m/s], mass [kg]
+        # what is added up there, in double precision on a CPU: the sums of many would drift in single precision
+        self.sums_real: type = wp.float64 if on_cpu else self.real
+        self.sums: wp.array = self.zeros((self.workers, 0), vector4(self.sums_real))  # momentum [kg m/s], mass [kg]
+        self.grid: wp.array = self.zeros(0, vector4(self.real))  # of all workers
         self.node_velocity: wp.array = self.zeros(0, vec3)  # [m/s]
         self.touched: wp.array = self.zeros((1, 1), wp.int32)  # [hook, node] stamps
         # distance from what is gripped [cells], the velocity imposed there [m/s], the node to follow: see `hold`
@@ -125,7 +128,8 @@ class Arrays:
         self.node_count = int(np.prod(size))
         if self.node_count > self.capacity:
             self.capacity = int(1.5 * self.node_count) + 1  # one more: see `columns`
-            self.grid = self.zeros((self.workers, self.capacity), vector4(self.real))
+            self.sums = self.zeros((self.workers, self.capacity), vector4(self.sums_real))
+            self.grid = self.zeros(self.capacity, vector4(self.real))
             self.node_velocity = self.zeros(self.capacity, vector(self.real))
             if self._touch_count:
                 self.touched = self.zeros((self._touch_count, self.capacity), wp.int32)

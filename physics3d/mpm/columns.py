@@ -1,15 +1,17 @@
 """Sums over the 27 nodes around a particle: the inner loops of the transfers, each in two forms.
 
     gathered(v, ...)        rows sum w v, sum w v r_x, sum w v r_y, sum w v r_z                 r = x_i - x_p [cells]
-    spread(grid, ...)       node += w (q + A r, m)
+    spread(grid, ...)       node += w (q + A r, m)                                      q = m v
     spread_vectors(grid, ...)  node += w (q + A r)
     spread_adjoint(G, ...)  with (P, M) of a node: rows of `gathered` for (P, M), then sum grad w [P . (q + A r) + m M]
     gathered_adjoint(v, ...)  node += w (V + B r);  rows sum w v, sum grad w [v . (V + B r)]
 
 Nodes along z are neighbours in memory: a column of three. The plain form is Warp and runs anywhere. The `fast` one is
 the same loop in Clang's vectors of four, for the CPU: twice as fast, because Warp's code for a vector works on single
-numbers and checks every index for its sign. A test holds them together. An array of 3-vectors is read in fours here:
-it needs one more element than there are nodes.
+numbers and checks every index for its sign. A test holds them together. There `gathered` and `spread` compute weights
+and sums in double precision whatever goes in and comes out: in single precision the weights do not add up to one, and
+momenta that are added to a node lose what 1e-7 of the sum is, in every substep. An array of 3-vectors is read in fours
+here: it needs one more element than there are nodes.
 """
 
 from functools import cache
@@ -34,9 +36,9 @@ def gathered(real, fast: bool) -> wp.Function:
     if fast:
 
         @wp.func_native(
-            _head(real)
+            _wide_head(real)
             + """
-            const T* first = (const T*)v.data + 3 * (size_t)node;
+            const R* first = (const R*)v.data + 3 * (size_t)node;
             const T z0 = wz[0] * (0 - f[2]), z1 = wz[1] * (1 - f[2]), z2 = wz[2] * (2 - f[2]);
             V mean = {}, bx = {}, by = {}, bz = {};
             #pragma unroll
@@ -44,8 +46,10 @@ def gathered(real, fast: bool) -> wp.Function:
                 V s = {}, sy = {}, sz = {};
                 #pragma unroll
                 for (int j = 0; j < 3; ++j) {
-                    const T* column = first + 3 * (i * ny + j) * (long long)nz;
-                    const V c0 = *(const V*)column, c1 = *(const V*)(column + 3), c2 = *(const V*)(column + 6);
+                    const R* column = first + 3 * (i * ny + j) * (long long)nz;
+                    const V c0 = __builtin_convertvector(*(const Q*)column, V);
+                    const V c1 = __builtin_convertvector(*(const Q*)(column + 3), V);
+                    const V c2 = __builtin_convertvector(*(const Q*)(column + 6), V);
                     const V t = wy[j] * (wz[0] * c0 + wz[1] * c1 + wz[2] * c2);
                     s += t;
                     sy += (j - f[1]) * t;
@@ -56,11 +60,11 @@ def gathered(real, fast: bool) -> wp.Function:
                 by += wx[i] * sy;
                 bz += wx[i] * sz;
             }
-            wp::mat_t<4, 4, T> found;
-            *(V*)found.data[0] = mean;
-            *(V*)found.data[1] = bx;
-            *(V*)found.data[2] = by;
-            *(V*)found.data[3] = bz;
+            wp::mat_t<4, 4, R> found;
+            *(Q*)found.data[0] = __builtin_convertvector(mean, Q);
+            *(Q*)found.data[1] = __builtin_convertvector(bx, Q);
+            *(Q*)found.data[2] = __builtin_convertvector(by, Q);
+            *(Q*)found.data[3] = __builtin_convertvector(bz, Q);
             return found;
             """
         )
@@ -99,18 +103,18 @@ def gathered(real, fast: bool) -> wp.Function:
 
 
 @cache
-def spread(real, fast: bool) -> wp.Function:
-    """spread(grid: array[vec4], first node, ny, nz, w, q, m, A), q and A r being those of the lowest node at first."""
-    vec3, vec4, mat33 = _vector(real, 3), _vector(real, 4), wp.types.matrix((3, 3), real)
+def spread(real, fast: bool, sums) -> wp.Function:
+    """spread(grid: array[vec4 of `sums`], first node, ny, nz, f, w, q, m, A); `sums` of the fast form are double."""
+    vec3, vec4, mat33 = _vector(real, 3), _vector(sums, 4), wp.types.matrix((3, 3), real)
 
     if fast:
 
         @wp.func_native(
-            _head(real)
+            _wide_head(real)
             + _columns_of_A
             + """
             V* first = (V*)grid.data + node;
-            V qi = {q[0], q[1], q[2], m};
+            V qi = V{q[0], q[1], q[2], m} - T(f[0]) * ax - T(f[1]) * ay - T(f[2]) * az;
             #pragma unroll
             for (int i = 0; i < 3; ++i) {
                 V qj = qi;
@@ -128,16 +132,18 @@ def spread(real, fast: bool) -> wp.Function:
             }
             """
         )
-        def native(grid: wp.array(dtype=vec4), node: int, ny: int, nz: int, w: mat33, q: vec3, m: real, A: mat33): ...
+        def native(
+            grid: wp.array(dtype=vec4), node: int, ny: int, nz: int, f: vec3, w: mat33, q: vec3, m: real, A: mat33
+        ): ...
 
         return native
 
     @wp.func
-    def plain(grid: wp.array(dtype=vec4), node: int, ny: int, nz: int, w: mat33, q: vec3, m: real, A: mat33):
+    def plain(grid: wp.array(dtype=vec4), node: int, ny: int, nz: int, f: vec3, w: mat33, q: vec3, m: real, A: mat33):
         ax = vec3(A[0, 0], A[1, 0], A[2, 0])
         ay = vec3(A[0, 1], A[1, 1], A[2, 1])
         az = vec3(A[0, 2], A[1, 2], A[2, 2])
-        qi = q  # built up by its increments from node to node
+        qi = q - A * f  # of the lowest node; built up by its increments from node to node
         for i in range(3):
             qij = qi
             for j in range(3):
@@ -145,7 +151,9 @@ def spread(real, fast: bool) -> wp.Function:
                 qijk = qij
                 for k in range(3):
                     weight = wij * w[2, k]
-                    value = vec4(weight * qijk[0], weight * qijk[1], weight * qijk[2], weight * m)
+                    value = vec4(
+                        sums(weight * qijk[0]), sums(weight * qijk[1]), sums(weight * qijk[2]), sums(weight * m)
+                    )
                     wp.atomic_add(grid, node + (i * ny + j) * nz + k, value)
                     qijk = qijk + az
                 qij = qij + ay
@@ -386,14 +394,32 @@ def gathered_adjoint(real, fast: bool) -> wp.Function:
 
 def _head(real) -> str:
     """A number, four of them anywhere in memory, and the weights along each axis."""
-    name = "float" if real is wp.float32 else "double"
     return f"""
-            typedef {name} T;
+            typedef {_NAME[real]} T;
             typedef T V __attribute__((vector_size(4 * sizeof(T)), aligned(sizeof(T)), may_alias));
             const T *wx = w.data[0], *wy = w.data[1], *wz = w.data[2];
             """
 
 
+def _wide_head(real) -> str:
+    """Sums and the weights at f in double precision (T, V), beside the numbers that go in (R, Q)."""
+    weights = "".join(
+        f"""
+            const T a{k} = T(1.5) - f[{k}], b{k} = f[{k}] - T(1), c{k} = f[{k}] - T(0.5);
+            const T w{axis}[3] = {{T(0.5) * a{k} * a{k}, T(0.75) - b{k} * b{k}, T(0.5) * c{k} * c{k}}};
+            """
+        for k, axis in enumerate("xyz")
+    )
+    return f"""
+            typedef {_NAME[real]} R;
+            typedef R Q __attribute__((vector_size(4 * sizeof(R)), aligned(sizeof(R)), may_alias));
+            typedef double T;
+            typedef T V __attribute__((vector_size(4 * sizeof(T)), aligned(sizeof(T)), may_alias));
+            {weights}
+            """
+
+
+_NAME = {wp.float32: "float", wp.float64: "double"}
 _slopes = """
             const T *gx = g.data[0], *gy = g.data[1], *gz = g.data[2];
             """

@@ -20,9 +20,9 @@ def particle_pass(
     real, material: wp.Function, pushes: tuple[Hook, ...], grips: tuple[Hook, ...], steers: tuple[Hook, ...]
 ) -> wp.Kernel:
     """Kernel: from the node velocities of substep `row` to the momentum of the next one."""
-    vec3, vec4, mat33 = vector(real), vector4(real), matrix(real)
+    vec3, vec4, mat33 = vector(real), vector4(wp.float64), matrix(real)
     first_node, local, weights, _ = stencil(real)
-    gathered, spread = columns.gathered(real, fast=True), columns.spread(real, fast=True)
+    gathered, spread = columns.gathered(real, fast=True), columns.spread(real, fast=True, sums=wp.float64)
     push, push_a, push_b, push_row = columns_of(pushes)
     grip, grip_a, grip_b, grip_row = columns_of(grips)
     steer = columns_of(steers)[0]
@@ -65,6 +65,7 @@ def particle_pass(
         p = wp.tid() + first
         r = row[0]
         dt = clock[r, 0]
+        rate = real(4.0) / dx
         ny, nz = window[4], window[5]
         place = u[p]
         d = offset[p] + place / dx
@@ -74,9 +75,7 @@ def particle_pass(
             w = weights(f)
             S = gathered(node_velocity, node, ny, nz, f, w)
             v = vec3(S[0, 0], S[0, 1], S[0, 2])
-            L = (real(4.0) / dx) * mat33(
-                S[1, 0], S[2, 0], S[3, 0], S[1, 1], S[2, 1], S[3, 1], S[1, 2], S[2, 2], S[3, 2]
-            )
+            L = rate * mat33(S[1, 0], S[2, 0], S[3, 0], S[1, 1], S[2, 1], S[3, 1], S[1, 2], S[2, 2], S[3, 2])
             if wp.static(grip_count > 0):
                 if keep == 1:
                     v_gathered[p] = v
@@ -121,8 +120,8 @@ def particle_pass(
                                 wp.static(grip[i])(weight, q, wp.static(grip_a[i]), clock, r, wp.static(grip_b[i])),
                             )
                     m = left * whole_mass[p]
-                    A = (m * dx) * L - (real(4.0) * kick * left * whole_volume[p] / dx) * stress
-                    spread(grid, node, ny, nz, weights(f), m * v - A * f, m, A)
+                    A = (real(4.0) * m) * (L / rate) - (rate * kick * left * whole_volume[p]) * stress
+                    spread(grid, node, ny, nz, f, weights(f), m * v, m, A)
                 else:
                     wp.atomic_add(lost, 0, 1)
         else:

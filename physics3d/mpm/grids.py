@@ -25,6 +25,28 @@ def clear(dtype) -> wp.Kernel:
 
 
 @cache
+def total_of_sums(real, sums) -> wp.Kernel:
+    """Kernel: 4-vectors of `real`, the sum over the rows of grids [threads, node] of `sums`, in a fixed order."""
+    vec4, wide = vector4(real), vector4(sums)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def total_of_sums_kernel(
+        # in
+        first: int,  # node of thread 0
+        grids: wp.array2d(dtype=wide),  # [threads, node]
+        # out
+        values: wp.array(dtype=vec4),  # [node]
+    ):
+        i = wp.tid() + first
+        s = grids[0, i]
+        for t in range(1, grids.shape[0]):
+            s = s + grids[t, i]
+        values[i] = vec4(real(s[0]), real(s[1]), real(s[2]), real(s[3]))
+
+    return total_of_sums_kernel
+
+
+@cache
 def total(dtype) -> wp.Kernel:
     """Kernel: sum over the rows of grids [threads, node] into the first row, in a fixed order."""
 

@@ -54,7 +54,7 @@ class Substeps:
         self.arrays = arrays
         real, fast = arrays.real, arrays.fast
         self.kernels: dict[str, wp.Kernel] = {
-            "scatter": transfer.scatter(real, fast),
+            "scatter": transfer.scatter(real, arrays.sums_real, fast),
             "update": update(real, hooks.node, hooks.touch, hooks.grip, arrays.mirrored),
             "gather": transfer.gather(real, fast),
             "advance": advance(real, material),
@@ -188,15 +188,15 @@ class Substeps:
         momenta: np.ndarray | None = None,  # [node, 4] gets what the nodes hold before the update
     ) -> None:
         """Velocities of the `count` nodes from `first` on, from the grids of all workers."""
-        if count and self.arrays.workers > 1:
+        if count:
             launch_over(launch["total"], first, count)
         if momenta is not None:
-            momenta[first : first + count] = self.arrays.grid.numpy()[0, first : first + count]
+            momenta[first : first + count] = self.arrays.grid.numpy()[first : first + count]
         self._update(launch, first, count, wait)
 
     def update_again(self, launch: Launches, first: int, count: int, wait: Wait, momenta: np.ndarray) -> None:
         """As `update` left the nodes, from the momenta that it kept."""
-        self.arrays.grid.numpy()[0, first : first + count] = momenta[first : first + count]
+        self.arrays.grid.numpy()[first : first + count] = momenta[first : first + count]
         self._update(launch, first, count, wait)
 
     def _update(self, launch: Launches, first: int, count: int, wait: Wait) -> None:
@@ -228,15 +228,16 @@ class Substeps:
 
     def _record(self, w: int, i: int, j: int) -> Launches:
         arrays = self.arrays
-        shared, count, vec4 = arrays.shared(w), arrays.ranges[w][1], vector4(arrays.real)
+        shared, count, sums = arrays.shared(w), arrays.ranges[w][1], arrays.sums_real
 
         def one(kernel: wp.Kernel, count: int, own: Arguments) -> wp.Launch:
             return record(kernel, count, own, shared=shared, device=arrays.device)
 
         arguments = self.arguments(w, i, j)
         launches = {name: one(kernel, count, arguments[name]) for name, kernel in self.kernels.items()}
-        launches["clear"] = one(grids.clear(vec4), 1, dict(first=0, values=arrays.grid[w]))
-        launches["total"] = one(grids.total(vec4), 1, dict(first=0, grids=arrays.grid))
+        launches["clear"] = one(grids.clear(vector4(sums)), 1, dict(first=0, values=arrays.sums[w]))
+        own = dict(first=0, grids=arrays.sums, values=arrays.grid)
+        launches["total"] = one(grids.total_of_sums(arrays.real, sums), 1, own)
         if arrays.grips:
             launches["clear_gripped"] = one(grids.clear(arrays.real), 1, dict(first=0, values=arrays.gripped[w]))
             launches["total_gripped"] = one(grids.total(arrays.real), 1, dict(first=0, grids=arrays.gripped))
@@ -249,7 +250,7 @@ class Substeps:
         a, b = arrays.state(i).warp, arrays.state(j).warp
         first = arrays.ranges[w][0]
         v = a["v"] if arrays.v_pushed is None else arrays.v_pushed
-        onto = dict(grid=arrays.grid[w], lost=arrays.lost[w])
+        onto = dict(grid=arrays.sums[w], lost=arrays.lost[w])
         gathered = dict(v_gathered=b["v_gathered"], L_gathered=b["L_gathered"])
         after = dict(u_next=b["u"], H_next=b["H"], memory_next=b["memory"])
         return {
@@ -257,9 +258,9 @@ class Substeps:
             "mark": dict(first=first, u=a["u"]),
             "scatter": dict(first=first, u=a["u"], v=v, L=a["L"], tau=a["tau"], **onto),
             "hold": dict(first=first, u=a["u"], gripped=arrays.gripped[w]),
-            "face": dict(first=0, gripped=arrays.gripped[0], grid=arrays.grid[0]),
-            "lead": dict(first=0, grid=arrays.grid[0]),
-            "update": dict(first=0, gripped=arrays.gripped[0], grid=arrays.grid[0]),
+            "face": dict(first=0, gripped=arrays.gripped[0], grid=arrays.grid),
+            "lead": dict(first=0, grid=arrays.grid),
+            "update": dict(first=0, gripped=arrays.gripped[0], grid=arrays.grid),
             "gather": dict(first=first, u=a["u"], v=b["v_gathered"], L=b["L_gathered"]),
             "steer": dict(first=first, u=a["u"], **gathered, v=b["v"], L=b["L"]),
             "advance": dict(

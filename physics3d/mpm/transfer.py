@@ -25,11 +25,12 @@ from physics3d.warp_types import matrix, vector, vector4
 
 
 @cache
-def scatter(real, fast: bool = False) -> wp.Kernel:
-    """Kernel: mass and momentum (with the internal forces of one step) of particles onto the nodes."""
-    vec3, vec4, mat33 = vector(real), vector4(real), matrix(real)
+def scatter(real, sums, fast: bool = False) -> wp.Kernel:
+    """Kernel: mass and momentum (with the internal forces of one step) of particles onto the nodes, added up there in
+    the precision of `sums`, which is double in the fast form."""
+    vec3, vec4, mat33 = vector(real), vector4(sums), matrix(real)
     first_node, local, weights, _ = stencil(real)
-    spread = columns.spread(real, fast)
+    spread = columns.spread(real, fast, sums)
 
     @wp.kernel(module="unique", enable_backward=False)
     def scatter_kernel(
@@ -58,11 +59,11 @@ def scatter(real, fast: bool = False) -> wp.Kernel:
         ny, nz = window[4], window[5]
         if node >= 0:
             f = local(d)
-            w = weights(f)
             m = mass[p]
-            A = (m * dx) * L[p] - (real(4.0) * kick * volume[p] / dx) * tau[p]
-            q = m * v[p] - A * f
-            spread(grid, node, ny, nz, w, q, m, A)
+            rate = real(4.0) / dx
+            # not (m dx) L: what rounding makes of dx would slow or speed up the spin of every particle alike
+            A = (real(4.0) * m) * (L[p] / rate) - (rate * kick * volume[p]) * tau[p]
+            spread(grid, node, ny, nz, f, weights(f), m * v[p], m, A)
         else:
             wp.atomic_add(lost, 0, 1)
 

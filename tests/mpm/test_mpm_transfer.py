@@ -61,13 +61,14 @@ def scatter(p, adjoint=None, fast=False):
     start_warp()
     real = wp.float64 if p["u"].dtype == torch.float64 else wp.float32
     vec3, vec4, mat33 = vector(real), vector4(real), matrix(real)
-    grid, lost = wp.zeros(SIDE**3, dtype=vec4, device="cpu"), wp.zeros(1, dtype=int, device="cpu")
+    # nodes add up in double precision
+    grid, lost = wp.zeros(SIDE**3, dtype=wp.vec4d, device="cpu"), wp.zeros(1, dtype=int, device="cpu")
     clock = wp.array(np.array([[0.0, 1.0, DT]]), dtype=real, device="cpu")
     inputs = [0, DX, window(), clock, wp.zeros(1, dtype=int, device="cpu")]
     inputs += [array(p["mass"], real), array(p["volume"], real), array(p["cell"], wp.vec3i), array(p["offset"], vec3)]
     inputs += [array(p["u"], vec3), array(p["v"], vec3), array(p["L"], mat33), array(p["tau"], mat33)]
     if adjoint is None:
-        wp.launch(transfer.scatter(real, fast), N, inputs=inputs, outputs=[grid, lost], device="cpu")
+        wp.launch(transfer.scatter(real, wp.float64, fast), N, inputs=inputs, outputs=[grid, lost], device="cpu")
         return wp.to_torch(grid), int(lost.numpy()[0])
     offset, *found = [wp.zeros_like(value) for value in (*inputs[-5:], *inputs[5:7])]
     inputs.append(array(adjoint, vec4))

@@ -60,12 +60,12 @@ class Constraints:
     def _difference(self, x: Tensor) -> Tensor:
         """P x by central differences."""
         system = self.system
-        there = system.grid[0].clone()
+        there = system.grid.clone()
         size = system.norm(there[:, :3] / system.safe_mass) / max(system.norm(x), torch.finfo(x.dtype).tiny)
         h = system.rounding ** (1 / 3) * size
         ends = []
         for sign in (1, -1):
-            system.grid[0, :, :3] = there[:, :3] + sign * h * system.mass * x
+            system.grid[:, :3] = there[:, :3] + sign * h * system.mass * x
             ends.append(system.update(gravity=system.falls))
-        system.grid[0] = there
+        system.grid.copy_(there)
         return (ends[0] - ends[1]) / (2 * h) if h > 0 else torch.zeros_like(x)

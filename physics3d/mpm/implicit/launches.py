@@ -118,7 +118,7 @@ class StepLaunches:
             for name in ("push", "hold", "face", "lead", "mark", "gather", "steer", "advance")
         }
         return calls | {
-            "scatter": (transfer.scatter(real), self._inertia(w), None),
+            "scatter": (transfer.scatter(real, arrays.sums_real), self._inertia(w), None),
             "update": (*update, None),
             "update_still": (update[0], update[1] | dict(gravity=vector(real)()), None),
             "stress": (
@@ -126,7 +126,7 @@ class StepLaunches:
                 dict(first=arrays.ranges[w][0], L=b["L"], tau=b["tau"], T=self.T, folded=self.folded[w]),
                 None,
             ),
-            "force": (transfer.scatter(real), self._force(w), None),
+            "force": (transfer.scatter(real, arrays.sums_real), self._force(w), None),
         }
 
     def _tangent(self, w: int) -> dict[str, Call | None]:

@@ -33,22 +33,23 @@ class System:
         self.particle_mass: Tensor = wp.to_torch(arrays.constant["whole_mass"])  # [p] kg
         self.volume: Tensor = wp.to_torch(arrays.constant["volume"])  # [p] m^3
         self.count: int = arrays.node_count
-        self.grid: Tensor = wp.to_torch(arrays.grid)[:, : self.count]  # [worker, node, 4]
+        self.sums: Tensor = wp.to_torch(arrays.sums)[:, : self.count]  # [worker, node, 4]
+        self.grid: Tensor = wp.to_torch(arrays.grid)[: self.count]  # [node, 4]
         self.nodes: Tensor = wp.to_torch(arrays.node_velocity)[: self.count]  # [node, 3]
         arrays.set_clock(clock)
         for w in range(arrays.workers):
             arrays.set_row(w, 0)
-        self.grid.zero_()
+        self.sums.zero_()
         if "mark" in launches.substeps.kernels:
             for w in range(arrays.workers):
                 arrays.new_stamp(w)
         launches.grip()
         launches.on_particles("push", "scatter", "mark")
-        total(self.grid)
+        self.grid.copy_(total(self.sums))
         if arrays.grips:
             launches.on_nodes("face")
             launches.on_nodes("lead")
-        self.base: Tensor = self.grid[0].clone()  # [node, 4] at the start of the step
+        self.base: Tensor = self.grid.clone()  # [node, 4] at the start of the step
         self.momentum, m = self.base.split((3, 1), 1)  # [node, 3], [node, 1]
         self.present: Tensor = (m > arrays.mass_floor).to(m.dtype)
         self.safe_mass: Tensor = torch.where(m > arrays.mass_floor, m, 1.0)
@@ -61,27 +62,27 @@ class System:
     def forces(self, v: Tensor) -> bool:
         """State j as v makes it, and the momentum on the grid that its stress makes; False if v folds a particle."""
         self.nodes.copy_(v)
-        self.grid.zero_()
+        self.sums.zero_()
         counts = (*self.launches.folded, *self.launches.arrays.lost)
         for count in counts:
             count.zero_()
         self.launches.on_particles("gather", "steer", "advance", "stress", "force")
-        total(self.grid)
-        self.grid[0] += self.base
+        self.grid.copy_(total(self.sums))
+        self.grid += self.base
         self.falls = True
-        return not any(int(count.numpy()[0]) for count in counts) and bool(torch.isfinite(self.grid[0]).all())
+        return not any(int(count.numpy()[0]) for count in counts) and bool(torch.isfinite(self.grid).all())
 
     def residual(self, v: Tensor) -> Tensor:
         """(v - B(v + s (u(v) - v)))/s [m/s] after `forces`. The root is the same for any s > 0; m over the diagonal of
         M + K guesses the nodes that separate far better than s = 1, which nodes that depend on each other need."""
         if self.coupled:
             return v - self.update(gravity=True)
-        u = self.present * self.decay * (self.grid[0, :, :3] / self.safe_mass + self.kick * self.gravity)
+        u = self.present * self.decay * (self.grid[:, :3] / self.safe_mass + self.kick * self.gravity)
         return (v - self.bounded(v + self.reach * (u - v))) / self.reach
 
     def bounded(self, v: Tensor) -> Tensor:
         """B(v)."""
-        self.grid[0, :, :3] = self.present * self.safe_mass * (v / self.decay)
+        self.grid[:, :3] = self.present * self.safe_mass * (v / self.decay)
         return self.update(gravity=False)
 
     def update(self, *, gravity: bool) -> Tensor:
