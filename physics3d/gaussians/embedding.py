@@ -3,7 +3,8 @@
     sum_j w_j = 1,   sum_j w_j X_j = X_g where the particles allow it
 
 The weights are those of moving least squares over the nearest particles: a bell exp(-|X_g - X_j|^2 / (2 spacing^2)),
-made linear-exact. Particles of another part, or beyond a gap, carry nothing.
+made linear-exact, so that an F that changes linearly with the place is carried exactly. Particles of another part, or
+beyond a gap, carry nothing.
 """
 
 from dataclasses import dataclass
@@ -17,6 +18,8 @@ from physics3d.artifact import AbstractArtifact, require_finite
 
 NEIGHBOURS = 8
 CANDIDATES = 20  # nearest particles among which those are sought
+BEYOND = 1.5  # from the middle of its particles to a Gaussian, to where their slope is followed [spacings]
+THIN = 0.01  # variance of the particles along an axis [spacings^2], below which there is no slope along it
 GAP = 1.75  # particles farther apart are not neighbours [spacings]; the diagonal of a cell of the lattice is 1.73
 
 
@@ -77,8 +80,10 @@ def embed(
         linked = _two_steps(tree, GAP * spacing)
         # in the order of distance, those behind a gap last and without weight
         behind = ~np.asarray(linked[near[:, :1].repeat(k, 1).ravel(), near.ravel()], bool).reshape(near.shape)
-        order = np.argsort(behind, axis=1, kind="stable")[:, :NEIGHBOURS]
+        order = np.argsort(behind, axis=1, kind="stable")
         near, distance, behind = (np.take_along_axis(a, order, 1) for a in (near, distance, behind))
+        chosen = _not_flat(X[at][near], distance, ~behind, spacing)
+        near, distance, behind = (np.take_along_axis(a, chosen, 1) for a in (near, distance, behind))
         neighbours[here, : near.shape[1]] = at[near]
         weights[here, : near.shape[1]] = _weights(points[here], X[at][near], distance, ~behind, spacing)
     return Embedding(
@@ -96,20 +101,42 @@ def _two_steps(tree, reach: float):
     return (links @ links > 0).tocsr()
 
 
-def _weights(point: np.ndarray, X: np.ndarray, distance: np.ndarray, reached: np.ndarray, spacing: float) -> np.ndarray:
-    """[g, k] of Gaussians at `point` [g, 3] for the particles X [g, k, 3]: a bell, then as linear-exact as is sound.
-
-    The correction is limited to one spacing beyond the particles, and absent across directions in which they do not
-    spread (a sheet, a thread).
+def _not_flat(X: np.ndarray, distance: np.ndarray, reached: np.ndarray, spacing: float) -> np.ndarray:
+    """[g, NEIGHBOURS] of the candidates [g, k] in order: the first, but for the last of them another one where the first
+    lie in a plane and a candidate does not. A Gaussian beside a surface may have none but those of the outermost layer.
     """
+    count = min(NEIGHBOURS, X.shape[1])
+    chosen = np.tile(np.arange(count), (len(X), 1))
+    if X.shape[1] > count:
+        first = slice(count)
+        _, centre, _, spread, axes = _moments(X[:, first], distance[:, first], reached[:, first], spacing)
+        off = np.abs(np.einsum("gki,gi->gk", X - centre[:, None], axes[:, :, 0]))
+        other = reached & (off > 0.5 * spacing)
+        other[:, first] = False
+        swap = (spread[:, 0] < 2 * THIN * spacing**2) & other.any(1)
+        chosen[swap, -1] = other[swap].argmax(1)
+    return chosen
+
+
+def _moments(X: np.ndarray, distance: np.ndarray, reached: np.ndarray, spacing: float) -> tuple[np.ndarray, ...]:
+    """Bell [g, k], weighted mean of the particles [g, 3], offsets from it, their variances and axes in rising order."""
     exponent = np.where(reached, -0.5 * (distance / spacing) ** 2, -np.inf)
     w = np.exp(exponent - exponent.max(1, keepdims=True))
     w /= w.sum(1, keepdims=True)
     centre = np.einsum("gk,gki->gi", w, X)
     offset = X - centre[:, None]
-    spread, axes = np.linalg.eigh(np.einsum("gk,gki,gkj->gij", w, offset, offset))
+    return w, centre, offset, *np.linalg.eigh(np.einsum("gk,gki,gkj->gij", w, offset, offset))
+
+
+def _weights(point: np.ndarray, X: np.ndarray, distance: np.ndarray, reached: np.ndarray, spacing: float) -> np.ndarray:
+    """[g, k] of Gaussians at `point` [g, 3] for the particles X [g, k, 3]: a bell, then as linear-exact as is sound.
+
+    The correction is limited to `BEYOND` of the particles' middle, and absent across directions in which they do not
+    spread (a sheet, a thread).
+    """
+    w, centre, offset, spread, axes = _moments(X, distance, reached, spacing)
     away = point - centre
-    away *= np.minimum(1, spacing / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-300))
-    inverse = np.where(spread > 0.02 * spacing**2, 1 / np.maximum(spread, 1e-300), 0.0)
+    away *= np.minimum(1, BEYOND * spacing / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-300))
+    inverse = np.where(spread > THIN * spacing**2, 1 / np.maximum(spread, 1e-300), 0.0)
     slope = np.einsum("gia,ga,gja,gj->gi", axes, inverse, axes, away)
     return w * (1 + np.einsum("gki,gi->gk", offset, slope))
