@@ -102,9 +102,8 @@ def _two_steps(tree, reach: float):
 
 
 def _not_flat(X: np.ndarray, distance: np.ndarray, reached: np.ndarray, spacing: float) -> np.ndarray:
-    """[g, NEIGHBOURS] of the candidates [g, k] in order: the first, but for the last of them another one where the first
-    lie in a plane and a candidate does not. A Gaussian beside a surface may have none but those of the outermost layer.
-    """
+    """[g, NEIGHBOURS] of the candidates [g, k], in order: the first, but for the last another one where the first lie
+    in a plane and a candidate does not. The nearest of one beside a surface may be one layer."""
     count = min(NEIGHBOURS, X.shape[1])
     chosen = np.tile(np.arange(count), (len(X), 1))
     if X.shape[1] > count:

@@ -61,7 +61,7 @@ def test_an_affine_motion_is_carried_exactly(motion, particles):
 @pytest.mark.parametrize("uneven", [0.0, 0.4])
 @pytest.mark.parametrize("where", ["inside", "on the surface"])
 def test_a_deformation_that_is_affine_in_the_place_is_carried_exactly(where, uneven):
-    """x = X + A X + 1/2 X B X, F = I + A + B X, with Gaussians on faces, edges and corners of a body of uneven particles."""
+    """x = X + A X + 1/2 X B X, F = I + A + B X, Gaussians on faces, edges and corners too."""
     generator = torch.Generator().manual_seed(2)
 
     def draw(*shape):
