@@ -21,6 +21,8 @@ SCALE, ROTATION = tuple(f"scale_{i}" for i in range(3)), tuple(f"rot_{i}" for i 
 FAR = 1000.0  # a model farther from the origin than so many of its own sizes is shifted: float32 has seven digits
 OPAQUE = 15.0  # logit of what is opaque: 3e-7 shines through
 THIN = np.log(1000.0)  # what is flat is so much thinner than wide [ln]
+NO_LOGIT = 60.0  # all above zero and some above this: not what training ends with, which stops growing near 20
+LARGEST = 1e37  # float32 holds a little more
 VANISHING = -87.0  # ln of the smallest float32
 
 
@@ -59,7 +61,8 @@ def read_ply(path: Path, *, log=None) -> Gaussians:
     def columns(names: tuple[str, ...], allowed: float = 0.0) -> np.ndarray:
         """As float64 [n, k]; finite, but for the infinity `allowed`."""
         for name in names:
-            bad = int((~np.isfinite(vertex[name]) & (vertex[name] != allowed)).sum())
+            with np.errstate(invalid="ignore"):
+                bad = int((~(np.abs(vertex[name]) < LARGEST) & (vertex[name] != allowed)).sum())
             if bad:
                 raise ValueError(
                     f"{path}: property {name} holds {bad} non-finite numbers of {len(vertex)}; repair the file or drop "
@@ -74,11 +77,15 @@ def read_ply(path: Path, *, log=None) -> Gaussians:
     opacity = vertex["opacity"].astype(np.float64)
     if np.isnan(opacity).any():
         columns(("opacity",))
+    turn = columns(ROTATION)
+    lost = int((np.linalg.norm(turn, axis=1) < 1e-12).sum())
+    if lost:
+        raise ValueError(f"{path}: {lost} Gaussians of {len(vertex)} have no rotation (rot_0..3 are 0); drop those")
     arrays = {
         "mean": mean,
         "log_scale": _log_scale(columns(scale, -np.inf), mean, _is_share(opacity), path, said),
-        "quaternion": columns(ROTATION),
-        "opacity_logit": _logit(opacity, said),
+        "quaternion": turn,
+        "opacity_logit": _logit(opacity, path, said),
         "sh": np.concatenate([dc, higher], 1),
     }
     gaussians = Gaussians(**{name: torch.from_numpy(a.astype(np.float32)) for name, a in arrays.items()})
@@ -109,11 +116,19 @@ def _is_share(opacity: np.ndarray) -> bool:
     return bool(opacity.min() >= 0 and 0 < opacity.max() <= 1)
 
 
-def _logit(opacity: np.ndarray, said: list[str]) -> np.ndarray:
+def _logit(opacity: np.ndarray, path: Path, said: list[str]) -> np.ndarray:
+    """Finite. Raises ValueError for what is neither a logit nor an opacity, and for a model that nobody can see."""
+    finite = opacity[np.isfinite(opacity)]
+    if finite.size and finite.min() >= 0 and finite.max() > NO_LOGIT:
+        raise ValueError(
+            f"{path}: opacity is {finite.min():.3g} to {finite.max():.3g}, neither logits nor 0..1; export it as 3DGS"
+        )
     if _is_share(opacity):
         said.append("opacity lies within 0..1 everywhere: taken as it is, not as a logit")
         with np.errstate(divide="ignore"):
             opacity = np.log(opacity) - np.log1p(-opacity)
+    if opacity.max() < -np.log(254):
+        raise ValueError(f"{path}: no Gaussian is more opaque than 1/255, so nothing would be seen; export it again")
     if np.isinf(opacity).any():
         said.append(f"{int(np.isinf(opacity).sum())} Gaussians are exactly opaque or exactly transparent")
     return np.where(np.isinf(opacity), np.sign(opacity) * OPAQUE, opacity)
@@ -136,6 +151,11 @@ def _log_scale(scale: np.ndarray, mean: np.ndarray, as_is: bool, path: Path, sai
     if scale.shape[1] == 2:
         said.append("there is no scale_2: Gaussians are flat")
         scale = np.concatenate([scale, np.full((len(scale), 1), -np.inf)], 1)
+    if scale.max() > -VANISHING:
+        raise ValueError(
+            f"{path}: {int((scale > -VANISHING).any(1).sum())} Gaussians of {len(scale)} have scale up to "
+            f"{scale.max():.3g}, of which the exponential is no number; drop those"
+        )
     flat = scale < VANISHING
     points = int(flat.all(1).sum())
     if points:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from physics3d.gaussians.cameras import Camera
 
+FAR = 1e9  # of a camera from the origin [source units]: nobody maps farther
 OPENGL_TO_OPENCV = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))  # of camera axes: y and z flip
 
 
@@ -63,6 +64,8 @@ def rigid_inverse(pose: Float64[Tensor, "4 4"], name: str) -> Float64[Tensor, "4
     """camera_to_world -> world_to_camera. Raises ValueError naming `name` if the pose is not a finite rigid motion."""
     if not torch.isfinite(pose).all():
         raise ValueError(f"{name}: the camera pose holds NaN or infinity; drop this image or solve its camera again")
+    if pose.abs().max() > FAR:
+        raise ValueError(f"{name}: the camera is {float(pose.abs().max()):.3g} units away; solve it again")
     R = pose[:3, :3]
     if (R @ R.T - torch.eye(3, dtype=torch.float64)).abs().max() > 1e-3 or torch.det(R) < 0:
         raise ValueError(f"{name}: the camera pose is not a rotation and a translation; remove its scale or mirroring")

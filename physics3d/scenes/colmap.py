@@ -98,6 +98,8 @@ def _pose(image: ColmapImage, path: Path) -> Float64[Tensor, "4 4"]:
     length = math.hypot(*image.quaternion)
     if length == 0:
         raise ValueError(f"{path}: the quaternion of its pose is zero; drop this image or solve its camera again")
+    if abs(length - 1) > 0.01:
+        raise ValueError(f"{path}: the quaternion of its pose has length {length:.3g}, not 1; solve its camera again")
     w, x, y, z = (q / length for q in image.quaternion)
     M = torch.eye(4, dtype=torch.float64)
     M[:3, :3] = torch.tensor(

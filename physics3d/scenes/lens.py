@@ -18,6 +18,8 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 NOTHING = 0.01  # a shift below this is none: sampling the picture again would cost more [px]
+SHORTEST = 0.04  # focal length as a share of the width: 170 degrees
+OFF_CENTRE = 2.0  # of the optical axis, as a share of the width: cropped pictures have it outside, but not far
 RIM = 200  # places along each side of the picture at which its rim is looked at
 
 
@@ -42,6 +44,16 @@ class Lens:
         if self.width < 1 or self.height < 1 or not (self.fx > 0 and self.fy > 0):
             raise ValueError(
                 f"{name}: size {self.width} x {self.height} and focal length {self.fx:g}, {self.fy:g} must be positive"
+            )
+        if self.fx < SHORTEST * self.width or self.fy < SHORTEST * self.height:
+            raise ValueError(
+                f"{name}: a focal length of {self.fx:g}, {self.fy:g} px sees nearly half of the world at "
+                f"{self.width} x {self.height}; give pixels, not shares of the width or millimetres"
+            )
+        if not (abs(self.cx / self.width - 0.5) < OFF_CENTRE and abs(self.cy / self.height - 0.5) < OFF_CENTRE):
+            raise ValueError(
+                f"{name}: the middle of the lens, cx {self.cx:g} and cy {self.cy:g}, is far outside of "
+                f"{self.width} x {self.height} pixels; give pixels from the upper left corner"
             )
 
     def resized(self, width: int, height: int) -> "Lens":

@@ -4,12 +4,14 @@ A name is looked for as it stands, then with slashes for backslashes, with any p
 other letters' case; of an absolute path of another machine, the longest end that exists below the folder counts.
 """
 
+import os
 import re
 from collections.abc import Iterable
 from pathlib import Path
 
 from physics3d.scenes.pictures import PHOTOGRAPHS
 
+LONGEST = 255  # bytes of one part of a name: what file systems allow
 MOST_MISSING = 1 / 3  # share of the images that may be lost
 
 
@@ -21,7 +23,11 @@ def read_text(path: Path) -> str:
 
 
 def find(folder: Path, name: str) -> Path:
-    """The file called `name` by a camera file beside or above `folder`'s images; where it should be if it is lost."""
+    """The file called `name` by a camera file beside or above `folder`'s images; where it should be if it is lost.
+
+    Raises ValueError for what no file can be called."""
+    if not isinstance(name, str) or "\0" in name or max(map(len, os.fsencode(name).split(b"/"))) > LONGEST:
+        raise ValueError(f"{str(name)[:50]!r}, beside {folder}, cannot be the name of a file; correct the camera file")
     plain = re.sub(r"^[A-Za-z]:", "", name).replace("\\", "/")
     expected = folder / (name if "\\" not in name else plain)
     tried = [Path(name), Path(plain)]

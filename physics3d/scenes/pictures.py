@@ -36,6 +36,7 @@ UNREAD = (
     ".exr",
 )  # formats to convert
 TURN = 0x0112  # the EXIF tag of the orientation
+BELOW = 0.2  # how far below black a number may be, as a share of white: sharpening and cubic sampling ring
 QUARTER = (5, 6, 7, 8)  # orientations that exchange width and height
 
 
@@ -106,6 +107,8 @@ def _from_pillow(file) -> np.ndarray:
     """[h, w] or [h, w, 3 or 4], of the type that tells the range."""
     if file.mode == "F" or file.mode.startswith("I"):
         return np.asarray(file)
+    if file.mode in ("LAB", "HSV"):  # these bands are not what their letters say in other modes
+        raise ValueError(f"its colours are {file.mode}; save it as RGB")
     if file.mode == "La":  # multiplied by alpha
         file = file.convert("LA")
     if {"A", "a"} & set(file.getbands()) or "transparency" in file.info:
@@ -132,7 +135,7 @@ def _to_255(stored: np.ndarray, path: Path) -> Float32[np.ndarray, "h w c"]:
     """Whatever range the type and the largest number tell -> 0..255. Raises ValueError if they do not tell it."""
     if stored.dtype.kind == "f" and not np.isfinite(stored).all():
         raise ValueError(f"the image {path} holds NaN or infinite pixels; save it again")
-    high = float(stored.max(initial=0))
+    high, low = float(stored.max(initial=0)), float(stored.min(initial=0))
     if stored.dtype == bool:
         full = 1.0
     elif stored.dtype == np.uint8:
@@ -145,6 +148,13 @@ def _to_255(stored: np.ndarray, path: Path) -> Float32[np.ndarray, "h w c"]:
     if full == 0:
         raise ValueError(
             f"the image {path} holds floating point numbers up to {high:.4g}, which is neither 0..1 nor 0..255; "
+            "save it with 8 or 16 bits"
+        )
+    if low < (-BELOW * full if stored.dtype.kind == "f" else 0):
+        raise ValueError(f"the image {path} holds numbers down to {low:.4g}; save it with 8 or 16 bits")
+    if full > 65535 and high < full / 256:
+        raise ValueError(
+            f"the image {path} has 32 bits and holds whole numbers up to {high:.4g}, of which all would be black; "
             "save it with 8 or 16 bits"
         )
     return np.clip(stored * np.float32(255 / full), 0, 255).astype(np.float32)

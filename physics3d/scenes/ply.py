@@ -50,6 +50,8 @@ class PlyScene(AbstractSource):
         solid = gaussians.mean[gaussians.opacity >= gaussians.opacity.median()].double()
         centre = solid.median(0).values
         radius = float((solid - centre).norm(dim=1).quantile(0.9))
+        if radius == 0:  # one Gaussian, or all at one place
+            radius = 3 * float(torch.exp(gaussians.log_scale.double()).amax(1).median())
         cameras = ring(
             tuple(centre.tolist()),
             distance=radius / math.sin(0.5 * math.radians(self.opening) * min(1.0, self.height / self.width)),

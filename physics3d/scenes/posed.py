@@ -63,6 +63,7 @@ class AbstractPosedSource(AbstractSource):
         require_fields(self, "source")
         background = triple("background", self.background)
         photographs, known = self.read(log)
+        _require_several_places(photographs)
         axes, floor = self._axes(photographs, known, log)
         images, alphas, cameras, names = [], [], [], []
         remarks: Counter[str] = Counter()
@@ -139,6 +140,17 @@ class AbstractPosedSource(AbstractSource):
         floor = float(-scale * plane[3])
         log.info(f"assumed: that plane is the floor, z = {floor:.3f} m")
         return Axes(up=up, scale=scale), floor
+
+
+def _require_several_places(photographs: list[Posed]) -> None:
+    """Raises ValueError if all cameras of several pictures are at one place, from which nothing has a depth."""
+    M = torch.stack([p.world_to_camera for p in photographs])
+    centres = -(M[:, :3, :3].mT @ M[:, :3, 3:])[..., 0]
+    if len(photographs) > 1 and (centres - centres[0]).abs().max() <= 1e-9 * (1 + centres[0].abs().max()):
+        raise ValueError(
+            f"all {len(photographs)} cameras are at {centres[0].tolist()}, from where nothing has a depth; the camera "
+            "must move between pictures"
+        )
 
 
 def fixed(lens: Lens) -> Callable[[int, int], Lens]:

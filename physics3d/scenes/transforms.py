@@ -81,15 +81,28 @@ class TransformsSource(AbstractPosedSource):
                 f"no camera file at {file}; check the path in the scene's configuration (DATA=... on the command line)"
             )
         try:
-            content = json.loads(read_text(file))
+            content = json.loads(read_text(file), object_hook=_without_nulls)
             _ = [frame["file_path"] + "" for frame in content["frames"]]
-        except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
+        except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, RecursionError) as error:
             raise ValueError(
                 f"{file} is not a transforms.json with a list of frames and their file_path: {error!r}"
             ) from error
         if not content["frames"]:
             raise ValueError(f"{file} lists no images; its frames are empty")
         return file, content
+
+
+def _without_nulls(entry: dict) -> dict:
+    """What is null is not said."""
+    return {name: value for name, value in entry.items() if value is not None}
+
+
+def _number(entry: dict, name: str, otherwise: float | None = None) -> float:
+    """A number of a camera file; not true or false, which Python takes as 1 and 0."""
+    value = entry[name] if otherwise is None else entry.get(name, otherwise)
+    if isinstance(value, bool):
+        raise ValueError(f"{name} is {value}")
+    return float(value)
 
 
 def _frames(file: Path, content: dict, log=None) -> list[tuple[Path, dict]]:
@@ -119,12 +132,12 @@ def _size(entry: dict, path: Path) -> tuple[int, int] | None:
     if "w" not in entry and "h" not in entry:
         return None
     try:
-        width, height = int(entry["w"]), int(entry["h"])
-        if width < 1 or height < 1:
-            raise ValueError("must be positive")
+        width, height = _number(entry, "w"), _number(entry, "h")
+        if not (width.is_integer() and height.is_integer() and width >= 1 and height >= 1):
+            raise ValueError("must be positive whole numbers")
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: w and h are {entry.get('w')}, {entry.get('h')}; give both, in pixels") from error
-    return width, height
+    return int(width), int(height)
 
 
 def _lens(file: Path, content: dict, frame: dict, path: Path, width: int, height: int) -> Lens:
@@ -135,8 +148,8 @@ def _lens(file: Path, content: dict, frame: dict, path: Path, width: int, height
         fy = _focal(frame, "y", height) or _focal(content, "y", height)
         if fx is None and fy is None:
             raise KeyError("fl_x")
-        k = {name: float(entry.get(name) or 0.0) for name in COEFFICIENTS}
-        cx, cy = float(entry.get("cx", width / 2)), float(entry.get("cy", height / 2))
+        k = {name: _number(entry, name, 0.0) for name in COEFFICIENTS}
+        cx, cy = _number(entry, "cx", width / 2), _number(entry, "cy", height / 2)
     except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
         raise ValueError(
             f"{file}: entry of {path.name} needs fl_x or camera_angle_x, and numbers for the lens: {error!r}"
@@ -158,9 +171,9 @@ def _lens(file: Path, content: dict, frame: dict, path: Path, width: int, height
 def _focal(entry: dict, axis: str, pixels: int) -> float | None:
     """Focal length along x or y [px], from fl_x or camera_angle_x; None where neither is given."""
     if f"fl_{axis}" in entry:
-        return float(entry[f"fl_{axis}"])
+        return _number(entry, f"fl_{axis}")
     if f"camera_angle_{axis}" in entry:
-        return pixels / 2 / math.tan(0.5 * float(entry[f"camera_angle_{axis}"]))
+        return pixels / 2 / math.tan(0.5 * _number(entry, f"camera_angle_{axis}"))
     return None
 
 

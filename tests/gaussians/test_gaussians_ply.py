@@ -165,6 +165,27 @@ def test_what_has_no_size_or_infinite_size_is_named(tmp_path):
         read_ply(tmp_path / "nan.ply")
 
 
+IMPOSSIBLE = {  # property -> its numbers, and what is said
+    "no rotation": (dict.fromkeys(("rot_0", "rot_1", "rot_2", "rot_3"), 0.0), "7 Gaussians of 7 have no rotation"),
+    "no number": ({"scale_1": 300.0}, "have scale up to 300"),
+    "invisible": ({"opacity": -np.inf}, "nothing would be seen"),
+    "faint": ({"opacity": -9.0}, "nothing would be seen"),
+    "bytes": ({"opacity": np.arange(7) * 30.0}, "opacity is 0 to 180, neither"),
+    "beyond float32": ({"x": 1e300}, "property x holds 7 non-finite"),
+    "beyond float32 in colour": ({"f_dc_1": -1e39}, "property f_dc_1 holds 7 non-finite"),
+}
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("name", IMPOSSIBLE)
+def test_what_no_model_can_hold_is_named(name, tmp_path):
+    columns, message = IMPOSSIBLE[name]
+    damaged(tmp_path / "a.ply", lambda vertex: retyped(vertex, "f8", **columns))
+    with pytest.raises(ValueError, match=rf"a\.ply: .*{message}") as caught:
+        read_ply(tmp_path / "a.ply")
+    assert "\n" not in str(caught.value)
+
+
 @pytest.mark.parametrize("unit", [1e-2, 1.0, 30.0])
 def test_opacity_and_scale_that_were_stored_as_they_are_are_told_apart(tmp_path, unit, rng):
     """A lattice of Gaussians half as wide as their distance; the unit decides the sign of ln."""

@@ -112,6 +112,10 @@ BROKEN = {
     "text.png": (lambda f: f.write_text("no picture"), "of no known format"),
     "phone.HEIC": (lambda f: f.write_bytes(b"\0\0\0 ftypheic"), "convert .HEIC to JPEG"),
     "nan.tif": (lambda f: Image.fromarray(np.full((4, 4), np.nan, np.float32)).save(f), "NaN"),
+    "negative.tif": (lambda f: Image.fromarray(np.full((4, 4), -0.5, np.float32)).save(f), "down to -0.5"),
+    "below.tif": (lambda f: Image.fromarray(np.full((4, 4), -7, np.int32)).save(f), "down to -7"),
+    "wide.tif": (lambda f: Image.fromarray(np.full((4, 4), 70000, np.int32)).save(f), "all would be black"),
+    "lab.tif": (lambda f: Image.fromarray(RAMP, "LAB").save(f), "colours are LAB"),
     "hdr.tif": (lambda f: Image.fromarray(np.full((4, 4), 3.0, np.float32)).save(f), "neither 0..1 nor 0..255"),
 }
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from physics3d.gaussians.cameras import Camera, look_at
-from physics3d.gaussians.model import Gaussians
+from physics3d.gaussians.model import FIELDS, Gaussians
 from physics3d.gaussians.ply import write_ply
 from physics3d.gaussians.render import render
 from physics3d.log import Log
@@ -57,6 +57,14 @@ def test_a_ply_becomes_a_capture_with_gaussians_and_views(tmp_path):
         uv, depth = camera.project(capture.gaussians.mean.double())
         inside = (depth > 0) & (uv > 0).all(1) & (uv[:, 0] < 32) & (uv[:, 1] < 24)
         assert inside.float().mean() > 0.7
+
+
+def test_a_single_gaussian_is_seen_from_all_around(tmp_path):
+    one = Gaussians(**{name: getattr(blob(0), name)[:1] for name in FIELDS})
+    write_ply(tmp_path / "one.ply", one)
+    source = PlyScene(name="one", path=str(tmp_path / "one.ply"), up=(0, 0, 1), scale=1.0, views=3, width=32, height=24)
+    capture = source(log=Log(None))
+    assert all(float(image.float().std()) > 5 for image in capture.images)
 
 
 def test_a_missing_or_broken_ply_is_named(tmp_path):

@@ -206,6 +206,14 @@ def test_what_a_frame_says_of_its_lens_holds_there(tmp_path):
         ({"fl_x": None, "fl_y": None}, "needs fl_x or camera_angle_x"),
         ({"w": 0}, "w and h are 0"),
         ({"h": None}, "give both"),
+        ({"w": float("inf")}, "give both, in pixels"),
+        ({"w": 48.5}, "give both, in pixels"),
+        ({"w": True}, "give both, in pixels"),
+        ({"fl_x": True}, "fl_x is True"),
+        ({"fl_x": 1.2, "fl_y": 1.2}, "give pixels, not shares"),  # of the width
+        ({"fl_x": None, "fl_y": None, "camera_angle_x": 3.14159}, "sees nearly half of the world"),
+        ({"cx": -5000.0}, "is far outside"),
+        ({"k1": True}, "k1 is True"),
     ],
 )
 def test_a_lens_that_cannot_be_is_named(change, message, tmp_path):
@@ -228,6 +236,52 @@ def test_a_pose_that_is_no_motion_is_named(turn, message, tmp_path):
         entry["transform_matrix"] = (turn @ np.array(entry["transform_matrix"])).tolist()
 
     refused(edited(tmp_path, frame=spoil), message)
+
+
+WRONG_NAMES = {"a number": 3, "too long": "a" * 300, "with a zero": "a\0b.png"}
+
+
+@pytest.mark.parametrize("field", ["file_path", "mask_path", "ply_file_path"])
+@pytest.mark.parametrize("name", WRONG_NAMES)
+def test_what_no_file_can_be_called_is_refused(name, field, tmp_path):
+    transforms(tmp_path)
+    if field == "ply_file_path":
+        source = edited(tmp_path, ply_file_path=WRONG_NAMES[name])
+    else:
+        source = edited(tmp_path, frame=lambda i, e: e.update({field: WRONG_NAMES[name]}))
+    with pytest.raises(ValueError, match="cannot be the name of a file|list of frames and their file_path") as caught:
+        source.files()
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_of_brackets_is_refused(tmp_path):
+    source = transforms(tmp_path)
+    (tmp_path / "transforms.json").write_text("[" * 100_000)
+    refused(source, "is not a transforms.json")
+
+
+def test_what_is_null_is_not_said(tmp_path):
+    transforms(tmp_path)
+    nothing = dict.fromkeys(("fl_x", "cx", "w", "k1", "mask_path", "camera_model"))
+    assert_all_there(edited(tmp_path, frame=lambda i, e: e.update(nothing))(log=Log(None)))
+
+
+@pytest.mark.parametrize("kind", [transforms, colmap])
+def test_cameras_at_one_place_or_out_of_reach_are_refused(kind, tmp_path):
+    source = kind(tmp_path)
+    file = tmp_path / "sparse/0/images.txt"
+    if kind is colmap:
+        text = file.read_text()
+        file.write_text(re.sub(r"(?m)^(\d+ \S+ \S+ \S+ \S+) \S+ \S+ \S+ ", r"\1 0 0 0 ", text))
+    else:
+        edited(tmp_path, frame=lambda i, e: [row.__setitem__(3, 0.5) for row in e["transform_matrix"][:3]])
+    refused(source, "all 5 cameras are at")
+    if kind is colmap:
+        file.write_text(re.sub(r"(?m)^(\d+) \S+ ", r"\1 9 ", text))
+        refused(source, "the quaternion of its pose has length 9")
+    else:
+        edited(tmp_path, frame=lambda i, e: e["transform_matrix"][i % 3].__setitem__(3, 1e300))
+        refused(source, "units away")
 
 
 def test_a_matrix_by_columns_is_named_and_three_rows_are_enough(tmp_path):
