@@ -249,7 +249,7 @@ def test_what_no_file_can_be_called_is_refused(name, field, tmp_path):
         source = edited(tmp_path, ply_file_path=WRONG_NAMES[name])
     else:
         source = edited(tmp_path, frame=lambda i, e: e.update({field: WRONG_NAMES[name]}))
-    with pytest.raises(ValueError, match="cannot be the name of a file|list of frames and their file_path") as caught:
+    with pytest.raises(ValueError, match=r"cannot be the name of a file|list of frames and their file_path") as caught:
         source.files()
     assert "\n" not in str(caught.value)
 
