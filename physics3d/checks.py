@@ -26,6 +26,7 @@ from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 from annotated_types import BaseMetadata, Ge, Gt, Le, Lt, MinLen, MultipleOf, Unit
 
 LARGEST = 1e18  # of any number: its square is finite in float32
+SMALLEST = 1e-18  # of any number that is not 0: its square is not 0 in float32
 MANY = 10**9  # of anything that is counted
 Elsewhere = Callable[[Any, Any, str], str | None]  # complaint about a value whose hint is a class of the project
 
@@ -203,7 +204,8 @@ def complaint(hint: Any, value: Any, name: str, elsewhere: Elsewhere = lambda hi
         case _:
             return elsewhere(bare, value, name)
     if inside is None and not (good and _within(value, limits, number=bare in (int, float))):
-        return f"{name} is {'null' if value is None else repr(value)}; take {describe(hint)}"
+        small = f", not nearer to 0 than {SMALLEST:g}" if good and _vanishes(value) else ""
+        return f"{name} is {'null' if value is None else repr(value)}; take {describe(hint)}{small}"
     return inside
 
 
@@ -265,7 +267,13 @@ def _bound(limit: Any) -> str:
 def _within(value: Any, limits: Sequence[Any], *, number: bool) -> bool:
     if number and not abs(value) < LARGEST and not (value == math.inf and MayBeInfinite() in limits):
         return False
+    if number and _vanishes(value):
+        return False
     return all(HOLDS[type(limit)](value, limit) for limit in limits if type(limit) in HOLDS)
+
+
+def _vanishes(value: Any) -> bool:
+    return isinstance(value, float) and 0 < abs(value) < SMALLEST
 
 
 HOLDS: dict[type, Callable[[Any, Any], bool]] = {

@@ -29,7 +29,8 @@ Box = Annotated[tuple[Share, Share, Share, Share], LeftTopRightBottom()]
 CASES = [  # hint, what it allows, what it does not, the remedy
     (bool, [True, False], [0, 1, "true", None], "take true or false"),
     (int, [0, -3], [1.0, True, "1", math.nan, None, [1]], "take a whole number"),
-    (float, [0, -1.5, 1e17], [math.nan, math.inf, -math.inf, 1e18, True, "1", None, [1.0]], "take a number between"),
+    (float, [0, -1.5, 1e17], [math.nan, math.inf, -math.inf, 1e18, 10**400, 1e-320, True, "1", None, [1.0], {}],
+     "take a number between"),
     (Annotated[int, Ge(2), Le(9), Unit("px")], [2, 9], [1, 10, 2.5], "take a whole number >= 2 and <= 9 [px]"),
     (Annotated[int, MultipleOf(8)], [0, 16], [4, 8.0], "a multiple of 8"),
     (Annotated[float, Ge(0), MayBeInfinite()], [0, math.inf], [-1, -math.inf, math.nan], "or .inf"),

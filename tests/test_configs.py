@@ -267,7 +267,7 @@ NULL_IS_FINE = re.compile(
 WORD_IS_FINE = re.compile(r"(capture\.clip|prompts\.\d\.view|render\.view|prior\.weights)$")
 CHOICES = re.compile(r"(kind|precision|scheme|solver|spring|flow|isolated|attach|device|learn\.\d+|ties\.\d\.\d)$")
 ORDERED = re.compile(r"(lower|upper|box|sigma|time)\.\d$")  # whether one number can be depends on its neighbours
-BAD = [math.nan, math.inf, -1, 0, 1e30, 1.5, "word", ["a", "list"], None]
+BAD = [math.nan, math.inf, -1, 0, 1e30, 10**400, 1e-320, 1.5, "word", ["a", "list"], None]
 
 
 def legal(key: str, old: Any, new: Any) -> bool | None:
@@ -278,7 +278,7 @@ def legal(key: str, old: Any, new: Any) -> bool | None:
         return None  # some sources can do without
     if new is None:
         return old is None or bool(NULL_IS_FINE.search(key))
-    if isinstance(new, list) or (isinstance(new, float) and math.isnan(new)) or new == 1e30:
+    if isinstance(new, list) or (isinstance(new, float) and math.isnan(new)) or new in (1e30, 10**400, 1e-320):
         return False
     if isinstance(old, bool):
         return False
