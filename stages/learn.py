@@ -47,6 +47,7 @@ from physics3d.priors.base import AbstractPrior
 from physics3d.priors.estimators.base import AbstractEstimator
 from physics3d.priors.estimators.sds import ScoreDistillation
 from physics3d.scenes.base import Capture, Footage, Outline
+from physics3d.truth import truth_of
 from physics3d.world import Estimate, Interval, World
 
 Span = Annotated[float, Gt(1), Le(1e12)]  # a factor
@@ -314,7 +315,8 @@ class Learn:
                 log.metric(f"sensitivity/{name}", 255 * float(seen.rms[i]))
                 visible = f"; a factor e changes the picture by {255 * float(seen.rms[i]):.2g} of 255"
             for part in name.split("+"):
-                truth = f", truth {capture.truth[part]:.4g}" if part in capture.truth else ""
+                true = truth_of(part, capture.truth)
+                truth = "" if true is None else f", truth {true:.4g}"
                 log.info(f"{part}: {before[part]:.4g} -> {after[part]:.4g}{truth}{visible}")
         if seen is None:
             log.info(
