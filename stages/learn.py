@@ -42,7 +42,7 @@ from physics3d.learning.search import search
 from physics3d.learning.stiffness_field import WIDTH, StiffnessField, asked_for, is_node, picture, trilinear
 from physics3d.learning.unknown_cause import learned_free
 from physics3d.log import Log
-from physics3d.pictures import contact_sheet, to_uint8
+from physics3d.pictures import contact_sheet, titled, to_uint8
 from physics3d.priors.base import AbstractPrior
 from physics3d.priors.estimators.base import AbstractEstimator
 from physics3d.priors.estimators.sds import ScoreDistillation
@@ -212,9 +212,8 @@ class Learn:
             with torch.no_grad():
                 view = next(iter(chain.clips))
                 clip = chain.render(chain.simulate(theta), view, chain.frames)
-            log.image(
-                "reference_above_learned", contact_sheet(to_uint8(torch.cat([chain.clips[view], clip], 1)), columns=5)
-            )
+            both = [titled(to_uint8(chain.clips[view]), "recorded"), titled(to_uint8(clip), "learned")]
+            log.image("reference_above_learned", contact_sheet(torch.cat(both, 1), columns=5))
         return learned
 
     def descended(self, chain: Chain, field: AbstractField, theta: Tensor, log: Log) -> tuple[Tensor, list[Point]]:
