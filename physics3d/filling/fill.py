@@ -200,12 +200,16 @@ def _bounded(
 
     def inside(x: np.ndarray) -> np.ndarray:
         found = within(x)
-        if view is not None:
-            found &= ~view.beside(x)
-            # below the ground, where it surely is, and never what is seen of the body
-            if below is not None and found.any():
-                buried = below.behind(x[found]) > spacing + below.doubt(x[found])
-                found[found] &= ~(view.deep(x[found]) & buried)
+        if view is None or not found.any():
+            return found
+        at = x[found]
+        past = view.beside(at)
+        if below is not None:
+            depth = below.behind(at)
+            past &= depth < 0  # nothing is seen past a body in the ground
+            # where the ground surely is, and never what is seen of the body
+            past |= view.deep(at) & (depth > spacing + below.doubt(at))
+        found[found] = ~past
         return found
 
     return inside

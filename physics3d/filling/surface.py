@@ -25,6 +25,9 @@ from physics3d.log import Log
 LEAST_SEEN = (
     0.1  # share of the samples of solid parts that cameras must see; fits of the scenes in conf/ have 0.66 and more
 )
+RIM = (0.5, 2.0)  # height above the ground of samples whose sides go on below it [spacings]
+DEEP = 2.0  # they go on at most so far [spacings]
+LEVEL = 0.7  # cosine to the ground's normal from which a sample is no side
 
 
 @dataclass(frozen=True)
@@ -77,8 +80,9 @@ def sample_surface(
     hidden = hidden | (solid & ~found)
     if below is not None:
         end, downwards = _ends_below(view, below, spacing)
-        point, normal = np.concatenate([point, end]), np.concatenate([normal, downwards])
-        none = np.zeros(len(end))
+        side, outwards = _sides_below(point[solid & found], normal[solid & found], view, below, spacing)
+        point, normal = np.concatenate([point, end, side]), np.concatenate([normal, downwards, outwards])
+        none = np.zeros(len(end) + len(side))
         thin, hidden = (np.concatenate([a, none > 0]) for a in (thin, hidden))
         deviation = np.concatenate([deviation, none])
     # what is filled reaches out to the samples where they are now
@@ -177,3 +181,30 @@ def _ends_below(view: Seen, below: Ground, spacing: float) -> tuple[np.ndarray, 
     under = view.deep(below.hidden) & ~view.beside(below.hidden)
     end = below.hidden - (spacing + below.doubt(below.hidden))[:, None] * below.normal
     return end[under], -below.normal[under]
+
+
+def _sides_below(
+    point: np.ndarray, normal: np.ndarray, view: Seen, below: Ground, spacing: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Down to these ends the sides go on as they are seen above the ground: samples and normals.
+
+    Else the body would be rounded off where it is held: a stem whose section shrinks to a third on its way into the
+    soil bends there.
+    """
+    high = -below.behind(point)
+    rim = np.flatnonzero((high > RIM[0] * spacing) & (high < RIM[1] * spacing))
+    if not len(rim) or not len(below.hidden):
+        return np.zeros((0, 3)), np.zeros((0, 3))
+    up = below.normal[cKDTree(below.hidden).query(point[rim], k=min(8, len(below.hidden)))[1]]
+    up = up.reshape(len(rim), -1, 3).mean(1)
+    up /= np.maximum(np.linalg.norm(up, axis=1, keepdims=True), 1e-9)
+    steep = np.abs((up * normal[rim]).sum(1)) < LEVEL
+    rim, up = rim[steep], up[steep]
+    along = up - (up * normal[rim]).sum(1, keepdims=True) * normal[rim]  # of the side itself
+    along /= (along * up).sum(1, keepdims=True)
+    depth = np.arange(1, 2 * (RIM[1] + DEEP) + 1) * spacing / 2
+    side = (point[rim, None] - depth[None, :, None] * along[:, None]).reshape(-1, 3)
+    outward = np.repeat(normal[rim], len(depth), 0)
+    behind = below.behind(side)
+    on = (behind > 0) & (behind < np.minimum(spacing + below.doubt(side), DEEP * spacing)) & view.deep(side)
+    return side[on], outward[on]
