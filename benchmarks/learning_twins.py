@@ -47,7 +47,8 @@ NOISE = 2.0 / 255  # deviation of a pixel
 SIDE = (80, 60)  # of the pictures [px]
 EVERY = 2  # so many frames of the scene's takes are one
 PARTICLES = 700  # about so many are learned with, where the scene's spacing would give more
-COUNT = 1200  # Gaussians
+COUNT = 2000  # Gaussians, small enough for tangents to stay near a round surface
+FLAT = 0.02  # thickness of the discs, of their radius
 BACKGROUND = (0.80, 0.83, 0.86)
 LIGHT = np.array([-0.39, -0.52, 0.74])  # direction to it
 FINER = 0.8  # spacing of the particles that move the truth, of those that learn
@@ -183,7 +184,7 @@ def painted(solids: list[Mesh], rng: np.random.Generator) -> tuple[Gaussians, fl
     n = np.where(n[:, 2:] < 0, -n, n)  # a disc has two sides
     turn = np.stack([1 + n[:, 2], -n[:, 1], n[:, 0], 0 * n[:, 0]], 1)
     radius = math.sqrt(total / COUNT / math.pi)
-    half = np.log(np.tile([radius, radius, 0.1 * radius], (len(x), 1)))
+    half = np.log(np.tile([radius, radius, FLAT * radius], (len(x), 1)))
     found = Gaussians(
         mean=torch.from_numpy(x).float(), log_scale=torch.from_numpy(half).float(),
         quaternion=torch.from_numpy(turn / np.linalg.norm(turn, axis=1, keepdims=True)).float(),

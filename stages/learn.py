@@ -33,7 +33,7 @@ from physics3d.learning.curves import curves
 from physics3d.learning.fields import AXES, AbstractField, GlobalField, physical
 from physics3d.learning.fit import fit
 from physics3d.learning.imagined import Imagined
-from physics3d.learning.interval import Beyond, intervals, is_stiff, posterior, words
+from physics3d.learning.interval import Beyond, Told, intervals, is_stiff, of_branches, posterior, told, words
 from physics3d.learning.linear import Shown, shown
 from physics3d.learning.loss import Chain
 from physics3d.learning.polish import polish
@@ -41,6 +41,7 @@ from physics3d.learning.rivals import widened
 from physics3d.learning.search import search
 from physics3d.learning.stiffness_field import WIDTH, StiffnessField, asked_for, is_node, picture, trilinear
 from physics3d.learning.unknown_cause import learned_free
+from physics3d.learning.valley import reaches
 from physics3d.log import Log
 from physics3d.pictures import contact_sheet, titled, to_uint8
 from physics3d.priors.base import AbstractPrior
@@ -53,6 +54,8 @@ from physics3d.world import Estimate, Interval, World
 Span = Annotated[float, Gt(1), Le(1e12)]  # a factor
 Width = Annotated[float, Gt(0), Le(20)]
 USUAL_FRAMES = 15  # of a clip, for priors that take any number
+USUAL_STEPS = 15  # of gradient descent, where nothing is polished
+LOOKS = 2  # along the valley: a lower place is polished once, and looked around from again
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,7 +70,8 @@ class Learn:
         tuple[Text, ...], ...
     ] = ()  # groups that share one factor, e.g. [[youngs_modulus, branch_shear_modulus]]
     learn_velocity: bool = False  # one initial velocity for the whole body
-    steps: Whole = 30  # of gradient descent
+    # of gradient descent; None: none where the polish begins from a search and does without, else USUAL_STEPS
+    steps: Whole | None = None
     polish: Whole = 0  # Levenberg steps after the descent; one costs a forward run per parameter and two
     learning_rate: Annotated[float, Gt(0), Le(10)] = 0.1  # first step of theta: 0.1 is ten per cent of a parameter
     duration: Duration | None = None  # only the first part of the take is used [s]; None: all of it
@@ -127,11 +131,11 @@ class Learn:
             )
         if take.excitation is None:
             width = self.guess_widths.get("youngs_modulus", self.guess_width)
-            told = learned_free(
+            free = learned_free(
                 self.world, capture, gaussians, body, zones=self.zones, width=width, beyond=self.beyond, log=log
             )
-            self.tell(told.intervals, log)
-            return told
+            self.tell(free.intervals, log)
+            return free
         start = self.world.estimate()
         section = look_ahead(body, self.world, take.excitation, log)
         indices = self.spread(take.footage)
@@ -170,15 +174,30 @@ class Learn:
         course: list[Point] = []
         if self.search:
             theta, course = self.searched(chain, whole, log)
-        if self.steps:
-            theta, descent = self.descended(chain, whole, theta, log)
+        polished = self.polish > 0 and chain.comparable
+        steps = self.steps
+        if steps is None:
+            steps = 0 if polished and self.search else USUAL_STEPS
+        if steps:
+            theta, descent = self.descended(chain, whole, theta, steps, log)
             course += descent
-        if self.polish and not chain.comparable:
+        if self.polish and not polished:
             log.info("no polish: single losses of this prior and estimator cannot be compared")
-        elif self.polish:
-            theta, polished = polish(chain, whole, theta, steps=self.polish, stay=self.stay, seed=self.seed, log=log)
-            course += polished
+        elif polished:
+            theta, points = self.polished(chain, whole, theta, log)
+            course += points
         seen = shown(chain, whole, theta, seed=self.seed) if chain.certain else None
+        said = self.said(whole, seen, log) if seen else None
+        for look in range(LOOKS if polished else 0):
+            assert seen is not None and said is not None  # what is comparable is certain
+            said, lower = self.looked_along(chain, whole, theta, seen, said, log)
+            if lower is None or look == LOOKS - 1:
+                break
+            log.info("along the valley the clip is explained better: the polish goes on from there")
+            theta, points = self.polished(chain, whole, whole.bound(theta + torch.from_numpy(lower)), log)
+            course += points
+            seen = shown(chain, whole, theta, seed=self.seed)
+            said = self.said(whole, seen, log)
         field: AbstractField = whole
         known = history(whole, course)
         if self.nodes and seen is None:
@@ -187,13 +206,14 @@ class Learn:
             finer = StiffnessField(whole=whole, weights=trilinear(body.position, self.nodes))
             over, more = replace(chained(finer, Log(None)), journal=chain.journal), finer.zero()
             more[: len(theta)] = theta
-            more, descent = self.descended(over, finer, more, log)
-            if self.polish and over.comparable:
-                more, polished = polish(over, finer, more, steps=self.polish, stay=self.stay, seed=self.seed, log=log)
-                descent += polished
+            more, descent = self.descended(over, finer, more, self.steps or USUAL_STEPS, log)
+            if polished:
+                more, points = self.polished(over, finer, more, log)
+                descent += points
             losses = chain.measure(theta, self.seed), over.measure(more, self.seed)
             if asked_for(losses, finer, seen.evidence, log):
                 field, theta, chain, seen = finer, more, over, shown(over, finer, more, seed=self.seed)
+                said = self.said(finer, seen, log)
                 known = {name: [*known.get(name, []), *curve] for name, curve in history(finer, descent).items()}
         beyond = self.beyond.of(section, self.world.dx, on_grid=chain.on_grid)
         learned = replace(
@@ -201,7 +221,7 @@ class Learn:
             parameters={name: v.detach().to(torch.float32) for name, v in field.parameters(theta).items()},
             velocity=field.velocity(theta).detach().to(torch.float32),
             history=known,
-            intervals=self.intervals(field, theta, seen, course, beyond, log) if seen else {},
+            intervals=self.intervals(field, theta, seen, said, course, beyond, log) if seen and said else {},
         )
         self.report(capture, field, learned, seen, log)
         if log.folder is not None:
@@ -216,13 +236,15 @@ class Learn:
             log.image("reference_above_learned", contact_sheet(torch.cat(both, 1), columns=5))
         return learned
 
-    def descended(self, chain: Chain, field: AbstractField, theta: Tensor, log: Log) -> tuple[Tensor, list[Point]]:
+    def descended(
+        self, chain: Chain, field: AbstractField, theta: Tensor, steps: int, log: Log
+    ) -> tuple[Tensor, list[Point]]:
         """Where gradient descent ends, and its course."""
         return fit(
             chain,
             field,
             theta,
-            steps=self.steps,
+            steps=steps,
             learning_rate=self.learning_rate,
             views_per_step=self.views_per_step,
             frames_per_step=self.frames_per_step,
@@ -231,6 +253,31 @@ class Learn:
             seed=self.seed,
             log=log,
         )
+
+    def polished(self, chain: Chain, field: AbstractField, theta: Tensor, log: Log) -> tuple[Tensor, list[Point]]:
+        """Where Levenberg's steps end, and their course."""
+        return polish(chain, field, theta, steps=self.polish, stay=self.stay, seed=self.seed, log=log)
+
+    def said(self, field: AbstractField, seen: Shown, log: Log) -> Told:
+        """What the clip says around what was learned."""
+        return told(seen.evidence, before=self.before(field), log=log)
+
+    def looked_along(
+        self, chain: Chain, field: AbstractField, theta: Tensor, seen: Shown, said: Told, log: Log
+    ) -> tuple[Told, np.ndarray | None]:
+        """`reaches` along the valley around theta, and where it is lower."""
+        pixels = sum(clip.numel() for clip in chain.clips.values())
+        return reaches(
+            said,
+            before=self.before(field),
+            rise=lambda d: float(d @ seen.evidence.JJ @ d) / (2 * pixels),
+            loss=lambda d: chain.measure(field.bound(theta + torch.from_numpy(d)), self.seed),
+            log=log,
+        )
+
+    def before(self, field: AbstractField) -> np.ndarray:
+        """Widths of what was thought of every component of theta."""
+        return np.array([self.width(name.split("+")[0]) for name in field.names])
 
     def spread(self, take: Footage) -> Tensor:
         """Which frames of the take are used: the first, and others spread over all of the duration.
@@ -282,20 +329,27 @@ class Learn:
         return search(chain, field, directions, offsets, seed=self.seed, log=log)
 
     def intervals(
-        self, field: AbstractField, theta: Tensor, seen: Shown, course: list[Point], beyond: Beyond, log: Log
+        self,
+        field: AbstractField,
+        theta: Tensor,
+        seen: Shown,
+        said: Told,
+        course: list[Point],
+        beyond: Beyond,
+        log: Log,
     ) -> dict[str, Interval]:
         """Of every learned number; `course`: what was tried; `beyond`: what pictures do not show."""
         unit = field.velocity_scale or 1.0
         speed = [float(v) / unit for v in field.velocity(theta)] if field.velocity_scale else []
         stiff = np.array([float(is_stiff(name)) for name in field.names])
         nodes = [0.0] * (len(field.names) - len(field.groups) - len(speed))
+        values = {name: float(value.mean()) for name, value in field.parameters(theta).items()}
         fast = np.array([0.0] * len(field.groups) + speed + nodes)
         after = posterior(
             theta.detach().numpy(),
-            seen.evidence,
-            before=np.array([self.width(n.split("+")[0]) for n in field.names]),
-            beyond=beyond.covariance(stiff, fast, seen.push),
-            log=log,
+            said,
+            before=self.before(field),
+            beyond=beyond.covariance(stiff, fast, seen.push, of_branches(field.names, values)),
         )
         return intervals(field, widened(after, course, seen.evidence, log))
 
@@ -323,10 +377,10 @@ class Learn:
             )
         self.tell(learned.intervals, log)
 
-    def tell(self, told: dict[str, Interval], log: Log) -> None:
+    def tell(self, found: dict[str, Interval], log: Log) -> None:
         """The intervals, in words and as metrics."""
-        for name, found in told.items():
-            log.info(f"{name}: {words(found)}")
-            log.metric(f"interval/{name}/low", found.low)
-            log.metric(f"interval/{name}/high", found.high)
-            log.metric(f"interval/{name}/deviation", found.deviation)
+        for name, one in found.items():
+            log.info(f"{name}: {words(one)}")
+            log.metric(f"interval/{name}/low", one.low)
+            log.metric(f"interval/{name}/high", one.high)
+            log.metric(f"interval/{name}/deviation", one.deviation)

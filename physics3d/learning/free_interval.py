@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float
 
 from physics3d.learning.free_motion import LIKELY, WIDTH, Material, Reduced, start, swinging
-from physics3d.learning.interval import Beyond, Posterior, log_normal, posterior
+from physics3d.learning.interval import Beyond, Posterior, log_normal, posterior, told
 from physics3d.learning.sandwich import Evidence, blocks, correlation_length
 from physics3d.learning.seen_modes import Observed, Sight
 from physics3d.log import Log
@@ -73,16 +73,14 @@ def free_posterior(
     summed = lambda values: np.stack([np.bincount(block, v, count) for v in values])
     each = lambda values: np.stack([summed(values[..., i]) for i in range(len(theta))], -1)
     stiff = np.eye(len(theta))[0]
+    evidence = Evidence(
+        JJ=np.einsum("tn,tncx,tncy->xy", weight, slope, slope, optimize=True), score=each(scores), share=each(shares)
+    )
     return posterior(
         theta - likely,
-        Evidence(
-            JJ=np.einsum("tn,tncx,tncy->xy", weight, slope, slope, optimize=True),
-            score=each(scores),
-            share=each(shares),
-        ),
+        told(evidence, before=before, log=log),
         before=before,
         beyond=replace(beyond, grid=beyond.modes).covariance(stiff, np.zeros(len(theta)), np.zeros(len(theta))),
-        log=log,
     )
 
 

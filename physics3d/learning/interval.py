@@ -10,11 +10,14 @@ sum of sigma^2 e e^T, with sigma a relative width (`Beyond`) and e the change of
 (moduli, stresses at yield, viscosities) scales alike, 1_m; with phi = A^-1 J^T dz/d(ln force) for forces that are known
 in newtons (0 where what drives the motion is a known motion, an acceleration, or unknown)
 
-    surface, grid    e = 1_m
+    surface, grid    e = 1_m; the surface is that of a mass as well, so half of the density's e besides: what is thicker
+                     by x bends 4 x harder and weighs 2 x more
     density          e = 1_m + phi: E goes with rho exactly, except for a known force. One that holds a thing bent says
                      E whatever it weighs (phi = -1); one that makes it swing says both
     length           e = 2 1_m + 4 phi: E goes with rho L^2; and velocities with L
     force            e = phi: a thing that was pushed harder than is said seems softer
+    branches         e = 1/share of a branch's modulus in the stiffness of fast motion, 0 else: half of surface and grid
+                     together, which need not be the same in slow and fast modes. A branch is known by the difference
 
 phi is exact where all that is stiff is learned. theta is ln of a number, of Poisson's ratio ln K/mu, or a velocity in
 its own unit (`fields.py`), so a 90 % interval of the number follows from that of theta.
@@ -22,6 +25,7 @@ its own unit (`fields.py`), so a 90 % interval of the number follows from that o
 
 import math
 import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated
 
@@ -71,17 +75,36 @@ class Beyond:
         return self if section is None else replace(self, grid=max(self.grid, 2 * section.grid_error(dx)))
 
     def covariance(
-        self, stiff: Float[np.ndarray, " k"], speed: Float[np.ndarray, " k"], push: Float[np.ndarray, " k"]
+        self,
+        stiff: Float[np.ndarray, " k"],
+        speed: Float[np.ndarray, " k"],
+        push: Float[np.ndarray, " k"],
+        branch: Float[np.ndarray, " k"] | float = 0.0,
     ) -> Float[np.ndarray, "k k"]:
-        """W. `stiff`: 1_m; `speed`: theta of what is a velocity, its start included, else 0; `push`: phi."""
+        """W. `stiff`: 1_m; `speed`: theta of what is a velocity, its start included, else 0; `push`: phi; `branch`: of
+        branches, `of_branches`."""
         changes = (
             (self.surface, stiff),
+            (self.surface / 2, stiff + push),
             (self.grid, stiff),
             (self.density, stiff + push),
             (self.length, 2 * stiff + speed + 4 * push),
             (self.force, push),
+            (math.hypot(self.surface, self.grid) / 2, branch * np.ones(len(stiff))),
         )
         return sum((width**2 * np.outer(e, e) for width, e in changes), np.zeros((len(stiff),) * 2))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Told:
+    """What a clip says of theta around theta_hat, in m directions that are independent of each other.
+
+    Distances are in units of what was thought beforehand: 1 along axis i changes theta by before * axes[:, i].
+    """
+
+    axes: Float[np.ndarray, "k m"]  # orthonormal; what no picture shows is in none of them
+    middle: Float[np.ndarray, " m"]  # of what the clip says, from theta_hat
+    deviation: Float[np.ndarray, " m"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,15 +116,8 @@ class Posterior:
     before: Float[np.ndarray, " k"]  # standard deviations
 
 
-def posterior(
-    theta: Float[np.ndarray, " k"],
-    evidence: Evidence,
-    *,
-    before: Float[np.ndarray, " k"],
-    beyond: Float[np.ndarray, "k k"],
-    log: Log,
-) -> Posterior:
-    """`theta`: found, from the middle of what was thought before; `before`: widths of that; `beyond`: W."""
+def told(evidence: Evidence, *, before: Float[np.ndarray, " k"], log: Log) -> Told:
+    """V + d d^T by its own directions; `before`: widths of what was thought beforehand."""
     found = spread(evidence)
     log.info(
         f"residuals hang together over {found.frames} frame(s) at a time; as good as {found.places:.1f} independent "
@@ -116,10 +132,24 @@ def posterior(
     V = gain.T @ (before[:, None] * found.B * before) @ gain
     fat = U.T @ (found.student[:, None] * U)
     undone = gain.T @ (before * evidence.score.sum((0, 1)))
-    V = fat @ V @ fat.T + np.outer(undone, undone) + U.T @ (beyond / before[:, None] / before) @ U
-    precision = U @ np.linalg.solve(V + 1e-12 * np.eye(len(V)), U.T)
+    V = fat @ V @ fat.T + np.outer(undone, undone)
+    variance, turn = np.linalg.eigh((V + V.T) / 2)
+    return Told(axes=U @ turn, middle=np.zeros(len(variance)), deviation=np.sqrt(np.maximum(variance, 1e-12)))
+
+
+def posterior(
+    theta: Float[np.ndarray, " k"],
+    said: Told,
+    *,
+    before: Float[np.ndarray, " k"],
+    beyond: Float[np.ndarray, "k k"],
+) -> Posterior:
+    """`theta`: found, from the middle of what was thought before; `before`: widths of that; `beyond`: W."""
+    U = said.axes
+    V = np.diag(said.deviation**2) + U.T @ (beyond / before[:, None] / before) @ U
+    precision = U @ np.linalg.solve(V, U.T)
     covariance = np.linalg.inv(np.eye(len(before)) + precision)
-    mean = covariance @ precision @ (theta / before)
+    mean = covariance @ precision @ (theta / before + U @ said.middle)
     return Posterior(mean=before * mean, covariance=before[:, None] * covariance * before, before=before)
 
 
@@ -167,6 +197,20 @@ def _coordinate(name: str, value: float) -> float:
 def is_stiff(name: str) -> bool:
     """Whether a parameter scales with the stiffness: it has the unit of a stress, or of a stress times a time."""
     return re.sub(r"_[23]$", "", name.split("+")[0]).endswith(STIFF)
+
+
+def of_branches(names: Sequence[str], values: Mapping[str, float]) -> Float[np.ndarray, " k"]:
+    """1/share of each component of theta that is a branch's shear modulus, in that of fast motion; 0 of the others.
+
+    `names` of the components (`a+b` where tied), `values` [SI] of all parameters."""
+    branch = {name: value for name, value in values.items() if name.startswith("branch_shear_modulus")}
+    if "youngs_modulus" in values:
+        slow = values["youngs_modulus"] / (2 * (1 + values.get("poissons_ratio", 0.3)))
+    else:
+        slow = values.get("shear_modulus", 0.0)
+    fast = slow + sum(branch.values())
+    own = [sum(branch.get(part, 0.0) for part in name.split("+")) for name in names]
+    return np.array([fast / value if value > 0 else 0.0 for value in own])
 
 
 def words(found: Interval) -> str:

@@ -10,6 +10,8 @@ from physics3d.learning.linear import linearise
 from physics3d.learning.loss import Chain
 from physics3d.log import Log
 
+SHORT = 1e-3  # of theta: a thousandth of a parameter
+
 
 def polish(
     chain: Chain, field: AbstractField, theta: Tensor, *, steps: int, stay: float, seed: int, log: Log
@@ -18,27 +20,29 @@ def polish(
 
         (J^T J + stay L_0 + m max diag J^T J) d = -(J^T (z0 - x0_hat) + stay L_0 theta)
 
-    with L_0 the loss where they begin: the pull to the start is measured by what is left unexplained, not by how bad
-    the start was, else one that is far off holds what the pictures hardly show. m grows by 8 on failure and falls by 4
-    on success. It is the same for all components, so that one which the pictures hardly show moves least. Returns theta
-    and where it was after every step.
+    with L_0 the loss where the step begins: the pull to the start is measured by what is left unexplained, and fades
+    as that does. Measured by how bad a start was it would hold what the pictures hardly show. m grows by 8, 64, 512 on
+    failures in a row and falls by 4 on success. It is the same for all components, so that one which the pictures
+    hardly show moves least. A step too short to matter ends it. Returns theta and where it was after every step.
     """
-    unit, m = max(chain.measure(theta, seed), 1e-12), 1e-3
-    pulled = lambda t: 0.5 * stay * unit * float(t.square().sum())
-    total = lambda t: chain.measure(t, seed) + pulled(t)
-    now, around, course = total(theta), None, []
+    now, m, grows = chain.measure(theta, seed), 1e-3, 8
+    around, course = None, []
     for step in log.progress(range(steps), "polishing"):
         around = around or linearise(chain, field, theta, seed=seed)
-        pull = stay * unit
-        A = around.JJ + (m * around.JJ.diagonal().max() + pull + 1e-9 * unit) * torch.eye(len(theta)).double()
+        pull = stay * max(now, 1e-12)
+        damping = m * around.JJ.diagonal().max() + pull + 1e-9 * max(now, 1e-12)
+        A = around.JJ + damping * torch.eye(len(theta)).double()
         d = torch.linalg.solve(A, -(around.Jr + pull * theta))
         trial = field.bound(theta + d.clamp(-1, 1))  # at most a factor e at once
-        then = total(trial)
-        log.metric("polish/loss", min(now, then), step)
-        if then < now:
-            theta, now, around, m = trial, then, None, m / 4
+        if float((trial - theta).abs().max()) < SHORT:
+            break
+        then = chain.measure(trial, seed)
+        gained = now - then + 0.5 * pull * float(theta.square().sum() - trial.square().sum())
+        log.metric("polish/loss", then if gained > 0 else now, step)
+        if gained > 0:
+            theta, now, around, m, grows = trial, then, None, m / 4, 8
         else:
-            m *= 8
-        course.append(Point(way="polish", theta=theta, loss=now - pulled(theta)))
-    log.info(f"polished: loss {now - pulled(theta):.5g}")
+            m, grows = m * grows, 8 * grows
+        course.append(Point(way="polish", theta=theta, loss=now))
+    log.info(f"polished: loss {now:.5g}")
     return theta, course

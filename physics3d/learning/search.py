@@ -2,7 +2,9 @@
 
 Offsets are tried along a line, equally far apart. Where the lowest loss is at an end, the line goes on from there by
 the same step, so that a start which is a factor 100 off is found as one that is a factor 2 off; it ends at the span of
-the field. A second valley that is nearly as deep is said: then the clip, as far as the search sees, has two answers.
+the field. Between the best and its neighbours the middles are tried as well, for of two places to either side of the
+best valley one may lie in another. A second valley that is nearly as deep is said: then the clip, as far as the search
+sees, has two answers.
 """
 
 import math
@@ -42,9 +44,14 @@ def search(
         if tried[best].loss <= tried[best + side * step].loss:
             break
         best += side * step
+    others = [other for other in valleys(tried) if other != best]
+    for side in (-1, 1):
+        if abs(best + side * step / 2) <= limit:
+            measure(best + side * step / 2)
+    best = min(tried, key=lambda offset: tried[offset].loss)
     table = ", ".join(f"x{math.exp(offset):.3g}: {tried[offset].loss:.4g}" for offset in sorted(tried))
     log.info(f"coarse search over the stiffness ({table}): start at x{math.exp(best):.3g}")
-    if others := [other for other in valleys(tried) if other != best]:
+    if others:
         log.warn(
             f"two valleys explain the clip: the stiffness may as well be near x{math.exp(others[0]):.3g} of the start; "
             "record for longer, or another push"

@@ -160,7 +160,17 @@ def test_the_search_finds_the_valley_from_starts_over_four_decades(start):
     found = start * math.exp(float(theta))
     assert abs(math.log(found)) <= 0.5 * math.log(2) + 1e-6
     needed = max(0, round(abs(math.log2(start))) - 2)
-    assert len(course) - 1 <= len(offsets) + needed + 1
+    assert len(course) - 1 <= len(offsets) + needed + 1 + 2  # the middles beside the best
+
+
+def test_a_valley_between_two_that_were_tried_is_found():
+    """Narrow, at sqrt(2) of the start, beside a shallow one at twice that: a search by factors of 2 falls to either
+    side of the deep one, and into the other."""
+    dip = lambda lnE: 0.1 - 0.1 * torch.exp(-((lnE / 0.1) ** 2)) - 0.03 * torch.exp(-(((lnE - 0.35) / 0.1) ** 2))
+    chain, field = seen_as(dip, math.sqrt(0.5))
+    offsets = (math.log(2) * torch.arange(-2, 3)).tolist()
+    theta, _ = search(chain, field, torch.ones(1).double(), offsets, seed=0, log=Log(None))
+    assert float(theta) == pytest.approx(math.log(2) / 2)
 
 
 def test_the_search_ends_at_the_span(tmp_path):

@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from physics3d.filling.section import Section
 from physics3d.learning.fields import GlobalField
-from physics3d.learning.interval import NORMAL, Beyond, intervals, is_stiff, posterior, words
+from physics3d.learning.interval import NORMAL, Beyond, intervals, is_stiff, of_branches, posterior, told, words
 from physics3d.learning.linear import shown
 from physics3d.learning.loss import Chain
 from physics3d.learning.polish import polish
@@ -44,6 +44,10 @@ def evidence_of(J: np.ndarray, r: np.ndarray) -> Evidence:
 
     flat = J.reshape(-1, k)
     return Evidence(JJ=flat.T @ flat, score=summed(J * r[..., None]), share=summed(J**2))
+
+
+def after_clip(theta: np.ndarray, evidence: Evidence, *, before: np.ndarray, beyond: np.ndarray):
+    return posterior(theta, told(evidence, before=before, log=Log(None)), before=before, beyond=beyond)
 
 
 @pytest.mark.parametrize("memory, blur", [(0.0, 0.0), (0.8, 1.0), (0.9, 1.5)])
@@ -113,16 +117,16 @@ def test_a_viscoelastic_oscillator_is_recovered_with_its_intervals():
         theta, _ = polish(noisy, field, field.zero(), steps=3, stay=0.0, seed=0, log=Log(None))
         seen = shown(noisy, field, theta, seed=0)
         none = np.zeros((3, 3))
-        after = posterior(theta.numpy(), seen.evidence, before=np.full(3, 2.3), beyond=none, log=Log(None))
-        told = intervals(field, after)
+        after = after_clip(theta.numpy(), seen.evidence, before=np.full(3, 2.3), beyond=none)
+        limits = intervals(field, after)
         for i, (name, true) in enumerate({"youngs_modulus": 9.0, "relaxation_time": 2.0}.items()):
-            hits[i] += told[name].low < true < told[name].high
-            assert told[name].determined
+            hits[i] += limits[name].low < true < limits[name].high
+            assert limits[name].determined
             found = float(field.parameters(theta)[name])
             errors.append(math.log(found / true))
             s = math.sqrt(np.linalg.inv(seen.evidence.JJ[:2, :2])[i, i] * float((e**2).mean()))
             naive[i] += abs(math.log(found / true)) < NORMAL * s
-        unseen = told["bulk_modulus"]
+        unseen = limits["bulk_modulus"]
         assert not unseen.determined and unseen.deviation == pytest.approx(2.3, rel=1e-3)
         assert words(unseen).startswith("not determined by this clip; between ")
         assert unseen.low == pytest.approx(2 * math.exp(-2.3 * NORMAL), rel=1e-2)
@@ -195,7 +199,7 @@ def test_a_wrong_force_moves_the_stiffness_as_is_said():
         W = Beyond(surface=0.0, grid=0.0, density=0.0, length=0.0, force=wrong).covariance(
             np.ones(1), np.zeros(1), push
         )
-        after = posterior(np.zeros(1), exact, before=np.full(1, 100.0), beyond=W, log=Log(None))
+        after = after_clip(np.zeros(1), exact, before=np.full(1, 100.0), beyond=W)
         deviation[name] = math.sqrt(after.covariance[0, 0]) / wrong
         assert abs(float(found[0])) / wrong == pytest.approx(deviation[name], abs=0.1)
     assert deviation["bent"] == pytest.approx(1, abs=1e-2) and deviation["free"] == pytest.approx(0, abs=1e-2)
@@ -207,8 +211,23 @@ def test_what_the_clip_does_not_show_widens_the_interval():
     J = np.random.default_rng(0).standard_normal((20, 8, 8, 2))
     exact = evidence_of(J, np.zeros((20, 8, 8)))
     W = Beyond(surface=0.0, grid=0.0).covariance(np.array([1.0, 0.0]), np.zeros(2), np.zeros(2))
-    after = posterior(np.zeros(2), exact, before=np.full(2, 100.0), beyond=W, log=Log(None))
+    after = after_clip(np.zeros(2), exact, before=np.full(2, 100.0), beyond=W)
     assert np.sqrt(after.covariance.diagonal()) == pytest.approx([math.sqrt(0.02), 0.0], abs=1e-4)
+
+
+def test_a_branch_is_known_by_what_it_adds():
+    """A spring k is seen in slow motion, k + m in fast: where the second errs by 3 % of itself, m does by (k + m)/m."""
+    spring, branch, wide = 5.0e4, 1.0e4, 0.06
+    names = ("youngs_modulus", "branch_shear_modulus+branch_bulk_modulus", "shear_relaxation_time")
+    values = {"youngs_modulus": 2.6 * spring, "poissons_ratio": 0.3, "branch_shear_modulus": branch}
+    share = of_branches(names, values)
+    assert share == pytest.approx([0, (spring + branch) / branch, 0])
+    none = dict(grid=0.0, density=0.0, length=0.0, force=0.0)
+    flat = np.zeros(3)
+    W = Beyond(surface=wide, **none).covariance(flat, flat, flat, share)
+    draws = np.random.default_rng(0).normal(0, wide / 2, 100_000)  # of what fast modes show
+    assert math.sqrt(W[1, 1]) == pytest.approx(np.std((draws * (spring + branch)) / branch), rel=0.01)
+    assert not W[0].any() and not W[2].any()
 
 
 def test_what_moved_the_body_decides_how_far_its_resolution_is_trusted():
@@ -228,7 +247,7 @@ def test_what_a_descent_left_undone_widens_the_interval():
     stopped = best + torch.tensor([0.05, -0.1, 0.0], dtype=torch.float64)
     seen = shown(chain, field, stopped, seed=0)
     none = np.zeros((3, 3))
-    after = posterior(stopped.numpy(), seen.evidence, before=np.full(3, 2.3), beyond=none, log=Log(None))
+    after = after_clip(stopped.numpy(), seen.evidence, before=np.full(3, 2.3), beyond=none)
     deviation = np.sqrt(after.covariance.diagonal())
     # the step back is that of a linearised chain, right to a third here; what is left of the pictures adds to it
     assert (deviation[:2] > 0.65 * np.array([0.05, 0.1])).all() and (deviation[:2] < 0.4).all()
