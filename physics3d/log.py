@@ -19,17 +19,22 @@ LINES_EVERY = 15.0  # between two lines of progress where there is no screen [s]
 
 
 class Log:
-    """Lines, curves, previews and progress of one computation, kept in `folder`, unless that is None."""
+    """Lines, curves, previews and progress of one computation, kept in `folder`, unless that is None.
 
-    def __init__(self, folder: Path | None, *, name: str = "", quiet: bool = False):
+    `said` are the lines that the person watching has read, of other computations too: they are kept, not printed again.
+    """
+
+    def __init__(self, folder: Path | None, *, name: str = "", quiet: bool = False, said: set[str] | None = None):
         self.folder = folder
         self.name = name
         self.quiet = quiet or folder is None
+        self.said = set() if said is None else said
         self.started = time.monotonic()
 
     def info(self, text: str) -> None:
         """One line for the person watching; kept in log.txt."""
-        if not self.quiet:
+        if not self.quiet and text not in self.said:
+            self.said.add(text)
             print(f"{self.name:>16} | {text}", flush=True)
         if self.folder is not None:
             with self.path(LINES).open("a") as lines:

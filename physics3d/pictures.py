@@ -7,6 +7,8 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
+STRIP = 14  # height of a line of letters [px]
+
 
 def to_uint8(image: Tensor) -> Tensor:
     """Float colour in 0..1 -> uint8, rounding to nearest."""
@@ -23,6 +25,17 @@ def contact_sheet(frames: UInt8[Tensor, "t h w 3"], *, columns: int = 6, count: 
     sheet = torch.full((rows * columns, h, w, 3), 255, dtype=torch.uint8)
     sheet[:t] = picks
     return sheet.reshape(rows, columns, h, w, 3).permute(0, 2, 1, 3, 4).reshape(rows * h, columns * w, 3)
+
+
+def titled(frames: UInt8[Tensor, "t h w 3"], title: str) -> UInt8[Tensor, "t k w 3"]:
+    """Each frame below a white strip that says what it is: for videos that stand above or beside each other."""
+    from PIL import Image, ImageDraw
+
+    t, _, w, _ = frames.shape
+    strip = Image.new("RGB", (w, STRIP), "white")
+    ImageDraw.Draw(strip).text((2, 1), title, fill="black")
+    letters = torch.from_numpy(np.array(strip)).to(frames.device)
+    return torch.cat([letters.expand(t, -1, -1, -1), frames], 1)
 
 
 def space_time_slice(frames: UInt8[Tensor, "t h w 3"], *, row: int | None = None, column: int | None = None) -> Tensor:

@@ -71,22 +71,23 @@ class Motion:
         except NotSolved as reason:
             if self.world.solver == "modes":
                 raise
-            self._say(f"{reason}: the grid takes over")
+            why = str(reason).partition("; take ")[0]  # its remedies are for those who want no grid
+            self._say("no motion", f"the modes find no motion ({why}): the grid takes over")
             return None
         touch = _touched(self.modes, self.volume, motion.position)
         if touch is None:
             return motion
         wall, frame = touch
-        what = f"the body reaches the {type(wall).__name__} in frame {frame}, which the modes do not feel"
+        kind = type(wall).__name__
+        what = f"the body reaches the {kind} in frame {frame}, which the modes do not feel"
         if self.world.solver == "modes":
-            self._say(f"{what}; take world.solver='grid' or 'auto'")
+            self._say(kind, f"{what}; take world.solver='grid' or 'auto'")
             return motion
-        self._say(f"{what}: the grid takes over")
+        self._say(kind, f"{what}: the grid takes over")
         return None
 
-    def _say(self, what: str) -> None:
-        """Once: the same wall and the same remedy do not become truer by being repeated."""
-        kind = what.split(" in frame ")[0] if " in frame " in what else what.split(":")[0]
+    def _say(self, kind: str, what: str) -> None:
+        """Once of a kind: the same wall, in whichever frame, does not become truer by being repeated."""
         if kind not in self.said:
             self.said.add(kind)
             self.log.warn(what)

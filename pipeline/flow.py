@@ -148,11 +148,12 @@ def execute(
         @flow(name="physics3d", flow_run_name=config["scene"]["name"], persist_result=False)
         def physics3d() -> tuple[Plan, list[Filed]]:
             filed: dict[Step, Filed] = {}
+            said: set[str] = set()  # what holds the body, and how well, is true of learning and of simulating it
 
             def compute(step: Step) -> None:
                 if damage(step, verify):
                     begin(step)
-                filed[step] = as_task(step, device, verify)([filed[s] for s in before(step)])
+                filed[step] = as_task(step, device, verify, said)([filed[s] for s in before(step)])
                 done(filed[step])
 
             capture = first(config, shelf)

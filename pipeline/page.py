@@ -12,7 +12,7 @@ from contextlib import suppress
 from functools import partial
 from typing import Annotated, Any
 
-from physics3d.checks import Count, Device, Like, Pixels, Seed, Text, complaint
+from physics3d.checks import Count, Device, Frames, Like, Pixels, Seed, Text, complaint
 from pipeline.fields import Class, Declared, Unknown, classes, declared
 
 STAGES = ("capture", "guess", "reconstruct", "segment", "fill", "learn", "simulate", "render", "foretell", "evaluate")
@@ -25,7 +25,7 @@ PLAIN = {  # entries that belong to no class
     "device": Device,
     "seed": Seed,
     "verify": bool,
-    "twin": {"views": Count, "width": Pixels, "height": Pixels},
+    "twin": {"views": Count, "width": Pixels, "height": Pixels, "frames": Frames},
     "scene": {"name": Text},
     "use": {name: Key | None for name in STEPS},
 }

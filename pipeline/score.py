@@ -44,7 +44,7 @@ def score(real: Path, predicted: Path, folder: Path) -> None:
     from physics3d.metrics.scores import Scores
     from physics3d.motion.clip import read_clip
     from physics3d.motion.stills import stills
-    from physics3d.pictures import contact_sheet
+    from physics3d.pictures import contact_sheet, titled
 
     pair = paired(read_clip(real), read_clip(predicted))
     whole = Reference(pair.real, pair.fps)
@@ -83,7 +83,9 @@ def score(real: Path, predicted: Path, folder: Path) -> None:
     }
     log.image("curves", curves(per_frame, pair.fps, first=seen))
     log.image("slices", slices(["real", "prediction"], [pair.real, pair.predicted], *busiest(pair.real)))
-    strips = [pair.real, pair.predicted, 255 - (pair.real.int() - pair.predicted.int()).abs().to(pair.real.dtype)]
+    difference = 255 - (pair.real.int() - pair.predicted.int()).abs().to(pair.real.dtype)
+    named = {"real": pair.real, "prediction": pair.predicted, "difference": difference}
+    strips = [titled(clip, name) for name, clip in named.items()]
     log.image("frames", contact_sheet(torch.cat(strips, 1), columns=8, count=8))
     pictures = (("frames", "real, prediction, difference"), ("curves", "per frame"), ("slices", "space-time slices"))
     text += ["", *(f"![{what}](previews/{name}.png)" for name, what in pictures)]

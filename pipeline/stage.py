@@ -126,8 +126,9 @@ class Filed:
     manifest: dict[str, Any]
 
 
-def run(step: Step, device: str, verify: bool = False) -> Filed:
-    """Reuse the step's artifact, or compute and file it. Raises StageError with one line naming the step."""
+def run(step: Step, device: str, verify: bool = False, said: set[str] | None = None) -> Filed:
+    """Reuse the step's artifact, or compute and file it; `said` as in Log. Raises StageError with one line naming the
+    step."""
     reason = damage(step, verify)
     if reason and step.taken:
         raise spoilt(step, reason)
@@ -138,7 +139,7 @@ def run(step: Step, device: str, verify: bool = False) -> Filed:
                 if os.path.lexists(step.folder):
                     _say(step, f"the stored result is damaged ({reason}); computing it again")
                 _sweep(step)
-                return Filed(step, False, _compute(step, device, verify))
+                return Filed(step, False, _compute(step, device, verify, said))
     return Filed(step, True, manifest(step))
 
 
@@ -299,11 +300,11 @@ def build(config: Any, device: str, where: str = "") -> Any:
         raise ValueError(f"{where}: {error}") from error
 
 
-def as_task(step: Step, device: str, verify: bool) -> Any:
+def as_task(step: Step, device: str, verify: bool, said: set[str] | None = None) -> Any:
     """The step as a Prefect task; call it with the results of the steps before it, so that Prefect draws the graph.
 
     It may run in another process, or on another machine, with the same code and the same shelf. `device` is `auto`
-    where that machine is to choose.
+    where that machine is to choose; `said` are the lines that the steps of a run share (`Log`), in one process.
     """
     from prefect import task
     from prefect.cache_policies import NO_CACHE
@@ -312,7 +313,7 @@ def as_task(step: Step, device: str, verify: bool) -> Any:
     def stage(after: list[Filed]) -> Filed:
         if reason := strange(step):
             raise StageError(f"{step.name}: {reason}")
-        return run(step, here(device), verify)
+        return run(step, here(device), verify, said)
 
     return stage
 
@@ -336,7 +337,7 @@ def strange(step: Step) -> str | None:
     return None
 
 
-def _compute(step: Step, device: str, verify: bool) -> dict[str, Any]:
+def _compute(step: Step, device: str, verify: bool, said: set[str] | None) -> dict[str, Any]:
     from physics3d.log import CHECKPOINT, LINES, PREVIEWS, Log
 
     temporary = step.unfinished
@@ -345,7 +346,7 @@ def _compute(step: Step, device: str, verify: bool) -> dict[str, Any]:
         for path in temporary.iterdir():  # a checkpoint has the curves; what else was left is written anew
             if path.name not in (CHECKPOINT, LINES, PREVIEWS):
                 _remove(path)
-        log = Log(temporary, name=step.name)
+        log = Log(temporary, name=step.name, said=said)
         stage = build(step.config, device, step.name)
         inputs = [load(source, device, verify) for source in step.inputs]
         _reset_peak()

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from physics3d.truth import truth_of
 from pipeline.flow import Plan
 from pipeline.stage import Step, manifest, peek
 
@@ -99,7 +100,7 @@ def parameters(plan: Plan) -> list[Parameter]:
         {key: intervals[name][key] for key in ("low", "high", "determined")} if name in intervals else {}
     )
     return [
-        Parameter(name=name, start=value, learned=learned.get(name), truth=truth.get(name), **sides(name))
+        Parameter(name=name, start=value, learned=learned.get(name), truth=truth_of(name, truth), **sides(name))
         for name, value in means(steps["guess"]).items()
     ]
 

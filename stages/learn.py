@@ -43,11 +43,12 @@ from physics3d.learning.stiffness_field import WIDTH, StiffnessField, asked_for,
 from physics3d.learning.unknown_cause import learned_free
 from physics3d.learning.valley import reaches
 from physics3d.log import Log
-from physics3d.pictures import contact_sheet, to_uint8
+from physics3d.pictures import contact_sheet, titled, to_uint8
 from physics3d.priors.base import AbstractPrior
 from physics3d.priors.estimators.base import AbstractEstimator
 from physics3d.priors.estimators.sds import ScoreDistillation
 from physics3d.scenes.base import Capture, Footage, Outline
+from physics3d.truth import truth_of
 from physics3d.world import Estimate, Interval, World
 
 Span = Annotated[float, Gt(1), Le(1e12)]  # a factor
@@ -231,9 +232,8 @@ class Learn:
             with torch.no_grad():
                 view = next(iter(chain.clips))
                 clip = chain.render(chain.simulate(theta), view, chain.frames)
-            log.image(
-                "reference_above_learned", contact_sheet(to_uint8(torch.cat([chain.clips[view], clip], 1)), columns=5)
-            )
+            both = [titled(to_uint8(chain.clips[view]), "recorded"), titled(to_uint8(clip), "learned")]
+            log.image("reference_above_learned", contact_sheet(torch.cat(both, 1), columns=5))
         return learned
 
     def descended(
@@ -368,7 +368,8 @@ class Learn:
                 log.metric(f"sensitivity/{name}", 255 * float(seen.rms[i]))
                 visible = f"; a factor e changes the picture by {255 * float(seen.rms[i]):.2g} of 255"
             for part in name.split("+"):
-                truth = f", truth {capture.truth[part]:.4g}" if part in capture.truth else ""
+                true = truth_of(part, capture.truth)
+                truth = "" if true is None else f", truth {true:.4g}"
                 log.info(f"{part}: {before[part]:.4g} -> {after[part]:.4g}{truth}{visible}")
         if seen is None:
             log.info(

@@ -98,18 +98,27 @@ class Render:
             raise ValueError(f"render.view is {self.view}; the capture has views 0 to {len(outline.names) - 1}")
 
     def say_motion(self, cameras: dict[str, Camera], trajectory: Trajectory, log: Log) -> None:
-        """How far the particle that is seen to move most moves in the pictures [px]; a warning if that is nothing."""
+        """How far the particle that is seen to move most moves in the pictures [px]; a warning if that is nothing, and
+        one if the body leaves them."""
         furthest = 0.0
-        for camera in cameras.values():
+        for name, camera in cameras.items():
             start, depth = camera.project(trajectory.rest_position.double())
+            size = torch.tensor([camera.width, camera.height])
+            gone = 0
             for x in trajectory.position:
                 now, behind = camera.project(x.double())
                 seen = (depth > 0) & (behind > 0)
                 if seen.any():
                     furthest = max(furthest, float((now - start)[seen].norm(dim=1).max()))
+                gone += not bool(((behind > 0) & (now >= 0).all(1) & (now < size).all(1)).any())
+            if gone:
+                log.warn(
+                    f"in {gone} of {len(trajectory.position)} frames nothing of the body is in the picture of {name}; "
+                    "push less, catch it earlier (a floor in scene.boundaries), or film from farther off (render.view)"
+                )
         log.metric("motion_px", furthest)
         if furthest >= LEAST_MOTION:
-            log.info(f"the body moves by up to {furthest:.2g} pixels")
+            log.info(f"the body moves by up to {furthest:.{0 if furthest >= 10 else 1}f} pixels")
         else:
             log.warn(
                 f"nothing is seen to move: at most {furthest:.2g} pixels; push harder (simulate.force, "

@@ -22,7 +22,7 @@ from physics3d.segmentation.maskers.base import AbstractMasker
 from physics3d.segmentation.maskers.grabcut import GrabCut
 from physics3d.segmentation.neighbours import beside_static, islands
 from physics3d.segmentation.previews import tinted
-from physics3d.segmentation.prompted import mask_of_box, prompted_mask
+from physics3d.segmentation.prompted import mask_of_boxes, prompted_mask
 from physics3d.segmentation.prompts import Prompt, within_any
 from physics3d.segmentation.rooms import Room
 from physics3d.segmentation.views import View, spread_out, view_of
@@ -151,7 +151,7 @@ class Segment:
         for part in parts:
             own = tuple(p for p in self.prompts if p.part == part)
             if part not in said and own:
-                found = {v.index: mask_of_box(own[0], v, self.masker) for v in log.progress(views, "masking the box")}
+                found = {v.index: mask_of_boxes(own, v, self.masker) for v in log.progress(views, "masking the boxes")}
                 masks[part] = {i: m for i, m in found.items() if m is not None}
             elif part not in said:
                 masks[part] = {v.index: np.ones(v.image.shape[:2], bool) for v in views}

@@ -97,7 +97,9 @@ def _report(trajectory: Trajectory, log: Log) -> None:
     moved = float((trajectory.position - trajectory.rest_position).norm(dim=2).max())
     size = float((trajectory.rest_position.amax(0) - trajectory.rest_position.amin(0)).max())
     log.metric("moved", moved)
-    log.info(f"it moves by at most {1e3 * moved:.3g} mm, {100 * moved / max(size, 1e-12):.2g} % of its size")
+    share = moved / max(size, 1e-12)
+    of_size = f"{100 * share:.2g} % of its size" if share < 1 else f"{share:.1f} times its size"
+    log.info(f"it moves by at most {1e3 * moved:.3g} mm, {of_size}")
     lonely = int(health["isolated"][0])
     if lonely:
         log.warn(f"{lonely} particles have no neighbour within a cell and move alone; fill more densely or enlarge dx")

@@ -32,6 +32,19 @@ def test_numbers_lines_and_pictures_are_kept(tmp_path):
     assert (tmp_path / "previews" / "frame_00002.png").stat().st_size > 0
 
 
+def test_what_was_said_is_kept_but_not_printed_again(tmp_path, capfd):
+    """By one step or by two that share what was said; a word more is another line."""
+    said: set[str] = set()
+    learn, simulate = (Log(tmp_path / name, name=name, said=said) for name in ("learn", "simulate"))
+    learn.warn("the stem is thin")
+    learn.warn("the stem is thin")
+    simulate.warn("the stem is thin")
+    simulate.warn("the stem is thin, and long")
+    printed = [line.strip() for line in capfd.readouterr().out.splitlines()]
+    assert printed == ["learn | warning: the stem is thin", "simulate | warning: the stem is thin, and long"]
+    assert [(tmp_path / name / "log.txt").read_text().count("is thin") for name in ("learn", "simulate")] == [2, 2]
+
+
 def test_progress_without_a_screen_is_a_few_whole_lines(tmp_path, capfd, monkeypatch):
     """Even if every step sets a postfix, which makes a bar draw itself anew."""
     bar = Log(tmp_path, name="learn").progress(range(50), "steps")

@@ -19,9 +19,10 @@ def join_pieces(
     drop_below: float,
     log: Log,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(particles to keep [p] bool, positions of new ones [b, 3], their part [b]); every piece is named in the log.
+    """(particles to keep [p] bool, positions of new ones [b, 3], their part [b]); every piece is in the log.
 
-    Pieces lie more than two spacings (a cell) apart. Those below `drop_below` of the volume are dropped, and so are all
+    Pieces lie more than two spacings (a cell) apart. Those below `drop_below` of the volume are dropped, which is said
+    of all of them in one line, and so are all
     but the largest if `isolated` is "drop"; their Gaussians ride on what remains. "attach" bridges a gap of at most
     JOINT spacings to a piece of the same part by particles a spacing apart; wider ones stay, as with "keep".
     """
@@ -33,9 +34,11 @@ def join_pieces(
     keep, bridges, of = np.ones(len(position), bool), [np.zeros((0, 3))], [np.zeros(0, part.dtype)]
     joined = piece == main
     lines = []
-    for k in sorted(set(range(count)) - {main}, key=lambda k: -share[k]):
+    small = [k for k in range(count) if k != main and share[k] < drop_below]
+    keep[np.isin(piece, small)] = False
+    for k in sorted(set(range(count)) - {main, *small}, key=lambda k: -share[k]):
         own = piece == k
-        if isolated == "drop" or share[k] < drop_below:
+        if isolated == "drop":
             keep[own], fate = False, "dropped; its Gaussians ride on the rest"
         elif isolated == "keep":
             joined |= own
@@ -57,7 +60,12 @@ def join_pieces(
     for line in lines[:8]:
         log.info(line)
     if len(lines) > 8:
-        log.info(f"{len(lines) - 8} more isolated pieces, smaller than these; {int((~keep).sum())} particles dropped")
+        log.info(f"isolated pieces besides, each smaller than these: {len(lines) - 8}")
+    if small:
+        log.info(
+            f"isolated pieces too small to keep: {len(small)}, of {int(np.isin(piece, small).sum())} particles, "
+            f"{100 * share[small].sum():.2g} % of the volume; dropped, their Gaussians ride on the rest"
+        )
     return keep, np.concatenate(bridges), np.concatenate(of)
 
 

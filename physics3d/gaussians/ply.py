@@ -102,7 +102,8 @@ def _near(mean: np.ndarray, stored_bytes: int, said: list[str]) -> np.ndarray:
         return mean
     unit = 10.0 ** np.floor(np.log10(size))
     offset = np.round(np.median(mean, 0) / unit) * unit
-    said.append(f"far from the origin: shifted by {(-offset).tolist()}, in the units and axes of the file")
+    shift = ", ".join(f"{s:.12g}" for s in -offset)
+    said.append(f"far from the origin: shifted by [{shift}], in the units and axes of the file")
     if stored_bytes < 8:
         step = float(np.spacing(np.float32(np.abs(mean).max())))
         said.append(

@@ -4,9 +4,10 @@ from typing import Any
 
 from physics3d.learning.course import WAYS
 from physics3d.scenes.base import Capture
+from physics3d.truth import truth_of
 from physics3d.world import Estimate
 
-GAIN = 5.0  # a curve that spans more than this factor is drawn in the logarithm
+GAIN = 5.0  # a curve that spans more than this factor, with its interval, is drawn in the logarithm
 
 
 def curves(capture: Capture, learned: Estimate):
@@ -26,16 +27,18 @@ def curves(capture: Capture, learned: Estimate):
             )
             if steps:
                 axis.plot(steps, [history[name][step] for step in steps], label=way, **style)
-        last = len(history["way"]) - 1
+        last, drawn = len(history["way"]) - 1, list(history[name])
         if name in learned.intervals:
             found = learned.intervals[name]
+            drawn += [found.low, found.high]
             axis.vlines(last, found.low, found.high, color="0.2", lw=1.0, label="90 %")
         axis.plot(last, history[name][-1], "o", color="0.2", ms=4)
-        if name in capture.truth:
-            axis.axhline(capture.truth[name], ls="--", color="0.4", label="truth")
-        if i == 0 or name in capture.truth:
+        true = truth_of(name, capture.truth)
+        if true is not None:
+            axis.axhline(true, ls="--", color="0.4", label="truth")
+        if i == 0 or true is not None:
             axis.legend(frameon=False, fontsize="small")
-        if max(history[name]) > GAIN * min(history[name]) > 0:
+        if max(drawn) > GAIN * min(drawn) > 0:
             axis.set_yscale("log")
         axis.set(title=name, xlabel="step")
     return figure

@@ -4,6 +4,7 @@ import math
 
 import torch
 
+from physics3d.truth import truth_of
 from physics3d.world import Estimate
 
 
@@ -11,9 +12,10 @@ def parameter_errors(estimates: dict[str, Estimate], truth: dict[str, float]) ->
     """ "learned: youngs_modulus" -> value, truth, error [%], ln(value/truth), ends of its 90 % interval
     where it has one; means over particles of a field."""
     table: dict[str, dict[str, float | None]] = {}
-    for parameter, true in truth.items():
+    for parameter in dict.fromkeys(name for estimate in estimates.values() for name in estimate.parameters):
+        true = truth_of(parameter, truth)
         for row, estimate in estimates.items():
-            if parameter in estimate.parameters:
+            if true is not None and parameter in estimate.parameters:
                 value = float(torch.as_tensor(estimate.parameters[parameter]).double().mean())
                 positive = value > 0 and true > 0
                 table[f"{row}: {parameter}"] = {

@@ -8,7 +8,7 @@ from torch import Tensor
 from physics3d.log import Log
 from physics3d.metrics.pictures import busiest, slices
 from physics3d.metrics.scores import FROZEN, REFERENCE, UNITS, Scores, columns
-from physics3d.pictures import contact_sheet
+from physics3d.pictures import contact_sheet, titled
 from physics3d.video import write_mp4
 
 
@@ -18,8 +18,9 @@ def previews(rows: dict[str, list[Tensor]], fps: float, scores: Scores, log: Log
     for camera in range(len(rows[REFERENCE])):
         clips = [rows[name][camera] for name in shown]
         suffix = f"_{camera}" if len(rows[REFERENCE]) > 1 else ""
-        write_mp4(log.path(f"previews/side_by_side{suffix}.mp4"), torch.cat(clips, 2), fps)
-        log.image(f"frames{suffix}", contact_sheet(torch.cat(clips, 1), columns=8, count=8))  # one row per video
+        named = [titled(clip, name) for clip, name in zip(clips, shown)]
+        write_mp4(log.path(f"previews/side_by_side{suffix}.mp4"), torch.cat(named, 2), fps)
+        log.image(f"frames{suffix}", contact_sheet(torch.cat(named, 1), columns=8, count=8))  # one row per video
         log.image(f"slices{suffix}", slices(shown, clips, *busiest(rows[REFERENCE][camera])))
     log.image("bars", bars(scores))
 

@@ -66,9 +66,8 @@ class PlyScene(AbstractSource):
                 to_uint8(render(gaussians, camera, background=triple("background", self.background)).color)
                 for camera in log.progress(cameras, "drawing the views")
             ]
-        log.info(
-            f"{len(gaussians)} Gaussians; nine tenths of the solid ones within {radius:.3g} m of {centre.tolist()}"
-        )
+        middle = ", ".join(f"{c:z.3f}" for c in centre.tolist())
+        log.info(f"{len(gaussians)} Gaussians; nine tenths of the solid ones within {radius:.3g} m of [{middle}] m")
         capture = Capture(
             name=self.name,
             images=tuple(images),

@@ -181,7 +181,7 @@ def where(capture: Capture, log) -> None:
     if seen is None:
         log.info("the cameras look at no common place; set excitation.centre by hand")
         return
-    middle = ", ".join(f"{m:.3f}" for m in seen.middle)
+    middle = ", ".join(f"{m:z.3f}" for m in seen.middle)
     log.info(
         f"the cameras look at [{middle}] m (e.g. for excitation.centre), from {seen.distance:.3g} m in the middle, "
         f"over {seen.span:.0f} degrees"

@@ -67,7 +67,7 @@ def captured(
     images, alphas, found, colors = photographs(studio.pose(), cameras, points=points, noise=noise, seed=seed, log=log)
     position, volume = matter
     kept = recorded(path_of(name), world, pokes, solids, frames=frames, fps=fps)
-    by = f"the grid, cells of {1e3 * world.dx:.2g} mm" if kept is None else kept[1]
+    by = f"the grid, cells of {1e3 * world.dx:.3g} mm" if kept is None else kept[1]
     log.info(f"reference motion: {by}")
     takes = [
         film(
@@ -169,7 +169,7 @@ def _by_grid(
     )
     trajectory.check()
     log.info(
-        f"{len(position)} particles, {1e6 * volume.sum():.0f} cm^3, cells of {1e3 * world.dx:.2g} mm, substeps of "
+        f"{len(position)} particles, {1e6 * volume.sum():.0f} cm^3, cells of {1e3 * world.dx:.3g} mm, substeps of "
         f"{trajectory.substep_dt:.2g} s"
     )
     x, F = (a.cpu().numpy() for a in (trajectory.position, trajectory.deformation))

@@ -33,14 +33,15 @@ def prompted_mask(prompts: tuple[Prompt, ...], others: tuple[Prompt, ...], view:
     return mask
 
 
-def mask_of_box(prompt: Prompt, view: View, masker: AbstractMasker) -> Bool[np.ndarray, "h w"] | None:
-    """Mask of a box in space: its inner pixels are positive, those outside negative, the masker decides between."""
+def mask_of_boxes(prompts: tuple[Prompt, ...], view: View, masker: AbstractMasker) -> Bool[np.ndarray, "h w"] | None:
+    """Mask of what is in any of the boxes in space: pixels inside of one are positive, those outside of all negative,
+    the masker decides between. None where the view shows next to nothing of them."""
     everything = np.ones(view.image.shape[:2], bool)
     opaque = (view.rendered.alpha > 0.5).numpy()
     point = view.points(everything)
     in_box, core = np.zeros_like(opaque), np.zeros_like(opaque)
-    in_box[opaque] = prompt.within(point).numpy()
-    core[opaque] = prompt.within(point, margin=0.1).numpy()
+    in_box[opaque] = np.any([prompt.within(point).numpy() for prompt in prompts], 0)
+    core[opaque] = np.any([prompt.within(point, margin=0.1).numpy() for prompt in prompts], 0)
     if core.sum() < 10:
         return None
     v, u = np.nonzero(in_box)

@@ -28,11 +28,14 @@ def pieces(body) -> int:
     return int(clusters(body.position.double().numpy(), 2 * SPACING).max()) + 1
 
 
-def test_small_pieces_are_dropped_when_asked(rng):
+def test_small_pieces_are_dropped_when_asked_and_said_in_one_line(rng, tmp_path):
     crumb = discs(*sphere(1500, 0.012, rng), rng)
-    crumb = replace(crumb, mean=crumb.mean + torch.tensor([0.1, 0, 0]))
-    gaussians = joined(discs(*sphere(8000, 0.05, rng), rng), crumb)
-    kept, dropped = filled(gaussians), filled(gaussians, drop_pieces_below=0.05)
+    crumbs = [replace(crumb, mean=crumb.mean + torch.tensor([side, 0, 0])) for side in (0.1, -0.1)]
+    gaussians = joined(joined(discs(*sphere(8000, 0.05, rng), rng), crumbs[0]), crumbs[1])
+    log = Log(tmp_path, quiet=True)
+    kept, dropped = filled(gaussians), filled(gaussians, drop_pieces_below=0.05, log=log)
+    said = [line for line in (tmp_path / "log.txt").read_text().splitlines() if "isolated piece" in line]
+    assert len(said) == 1 and "too small to keep: 2, of " in said[0]
     assert float(kept.position[:, 0].max()) > 0.08
     assert float(dropped.position[:, 0].max()) < 0.06
     assert len(dropped.embedding.which) == len(gaussians)

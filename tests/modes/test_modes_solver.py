@@ -1,5 +1,6 @@
 """Which solver is taken, and what is said about it."""
 
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -73,6 +74,19 @@ def test_a_body_that_comes_to_touch_a_wall_is_moved_by_the_grid_and_this_is_said
     assert torch.equal(found.position, by_grid.position)
     warned = [line for line in lines(tmp_path) if "the grid takes over" in line]
     assert len(warned) == 1 and "reaches the HalfSpace in frame" in warned[0]
+
+
+def test_what_the_modes_cannot_find_is_said_once_and_without_a_remedy_that_is_taken_already(tmp_path):
+    """A force of thousands of times the body's stiffness, in steps that may not be halved, at two moduli and so, as a
+    rule, in two frames."""
+    blow = Impulse(force=(0.0, 60.0, 0.0), centre=(0.055, 0.0, 0.0), radius=0.012, duration=0.1)
+    asked = elastic(dt=0.02)
+    motion = motion_of(asked, *row(6, 0.01), excitation=(blow,), device="cpu", log=Log(tmp_path, quiet=True))
+    for modulus in (1e4, 2e4):
+        with suppress(ValueError):  # the grid may refuse it too
+            motion(PARAMETERS | {"youngs_modulus": torch.tensor(modulus)}, frames=4, frame_dt=0.02, log=Log(None))
+    warned = [line for line in lines(tmp_path) if "the grid takes over" in line]
+    assert len(warned) == 1 and "the modes find no motion (frame " in warned[0] and "take " not in warned[0]
 
 
 def test_both_solvers_tell_the_same_of_a_poke():

@@ -1,7 +1,11 @@
-"""What a person reads of a parameter."""
+"""What a person reads of a parameter, and what is true of it."""
 
 import pytest
+import torch
 
+from physics3d.metrics.parameters import parameter_errors
+from physics3d.truth import truth_of
+from physics3d.world import Estimate
 from pipeline.told import Parameter
 
 
@@ -20,3 +24,20 @@ from pipeline.told import Parameter
 )
 def test_an_interval_is_told_in_words(told, words):
     assert Parameter(name="poissons_ratio", start=0.3, **told).between == words
+
+
+@pytest.mark.parametrize(
+    "name, true",
+    [
+        ("youngs_modulus", 1.5e5),
+        ("stem.youngs_modulus", 1.5e5),  # one material is that of all parts
+        ("petals.youngs_modulus", 2e4),  # said of the part itself
+        ("stem.yield_stress", None),
+    ],
+)
+def test_what_is_true_of_the_body_is_true_of_its_parts(name, true):
+    truth = {"youngs_modulus": 1.5e5, "petals.youngs_modulus": 2e4}
+    assert truth_of(name, truth) == true
+    estimate = Estimate(parameters={name: torch.tensor(3e5)}, velocity=torch.zeros(3))
+    table = parameter_errors({"learned": estimate}, truth)
+    assert [row["truth"] for row in table.values()] == ([] if true is None else [true])

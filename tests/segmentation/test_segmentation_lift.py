@@ -18,6 +18,7 @@ from physics3d.segmentation.maskers.base import AbstractVideoMasker
 from physics3d.segmentation.maskers.grabcut import GrabCut
 from physics3d.segmentation.neighbours import beside_static, islands
 from physics3d.segmentation.pixels import intersection_over_union
+from physics3d.segmentation.prompted import mask_of_boxes
 from physics3d.segmentation.prompts import Prompt
 from physics3d.segmentation.rooms import Room
 from physics3d.segmentation.views import View
@@ -121,6 +122,20 @@ def test_labels_of_one_view_are_right_where_they_show_in_others(scene):
         true = (true_map(gaussians, truth, camera) == 1).numpy()
         # 36 degrees on, a tenth of the ball was not seen yet and has the label of its neighbours
         assert ((share > 0.5) & true).sum() / ((share > 0.5) | true).sum() > 0.9
+
+
+def test_a_part_in_several_boxes_is_masked_in_all_of_them(scene):
+    """A red and a green ball, a box around each: the colours of one are no hint of the other."""
+    gaussians, truth, _ = scene
+    boxes = (
+        Prompt(lower=(-0.115, -0.055, -0.045), upper=(-0.005, 0.055, 0.055)),
+        Prompt(lower=(0.015, -0.045, -0.045), upper=(0.105, 0.045, 0.035)),
+    )
+    for own in (boxes, boxes[::-1]):
+        for view in views(gaussians)[::3]:
+            mask = mask_of_boxes(own, view, GrabCut())
+            true = (true_map(gaussians, truth, view.camera) > 0).numpy()
+            assert intersection_over_union(mask, true) > 0.9  # outlines of balls of 30 pixels, one pixel off
 
 
 def test_what_no_view_has_shown_may_be_of_the_nearest_part_that_has_room():
