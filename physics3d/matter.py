@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from scipy import sparse
+from scipy import ndimage, sparse
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -89,10 +89,18 @@ def of_samples(
 ) -> Matter:
     """Pieces of lattice cells of edge h [m], from samples: cell i begins at origin + h cell_i; `inside` [m, s] says
     which of its samples, at `offset` in the unit cell, are matter. `offset` has one in each of n^3 equal parts, x
-    slowest. Cells without matter make no piece."""
+    slowest. Cells without matter make no piece, and those in which matter lies to both sides of a gap make several."""
     some = inside.any(1)
     cell, inside, owner = cell[some], inside[some], owner[some]
     n = round(len(offset) ** (1 / 3))
+    # what hangs together within a cell: samples of neighbouring parts, none of them across the first axis
+    near = np.zeros((3, 3, 3, 3), int)
+    near[1] = 1
+    number = ndimage.label(inside.reshape(-1, n, n, n), near)[0].reshape(len(cell), -1) - 1  # of the piece, -1: none
+    which, lump = np.nonzero(number >= 0)[0], number[number >= 0]
+    _, first = np.unique(lump, return_index=True)
+    at = which[first]  # the cell of every piece
+    inside = number[at] == np.arange(len(at))[:, None]
     matter = inside.astype(float)
     count = matter.sum(1)
     mean = matter @ offset / count[:, None]
@@ -102,9 +110,9 @@ def of_samples(
     short = np.eye(3) / 12 - np.cov(offset.T, bias=True)
     moment += (1 / n**2 / 12 / count)[:, None, None] * np.eye(3) * (count < n**3)[:, None, None]
     moment += (count / n**3)[:, None, None] * short
-    moment, centroid = h**2 * moment, origin + h * (cell + mean)
+    moment, centroid = h**2 * moment, origin + h * (cell[at] + mean)
     # neighbours share a face on which both have matter
-    solid = inside.reshape(-1, n, n, n)
+    piece = number.reshape(-1, n, n, n)
     size = cell.max(0, initial=0) + 2
     key = (cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2]
     order = np.argsort(key)
@@ -113,14 +121,14 @@ def of_samples(
         there = np.minimum(np.searchsorted(key[order], key + step), len(key) - 1)
         first = np.flatnonzero(key[order[there]] == key + step)
         second = order[there[first]]
-        faces = np.take(solid[first], n - 1, axis + 1) & np.take(solid[second], 0, axis + 1)
-        touch = faces.any((1, 2))
-        links.append(np.stack([first[touch], second[touch]], 1))
+        faces = np.stack([np.take(piece[first], n - 1, axis + 1), np.take(piece[second], 0, axis + 1)], -1)
+        faces = faces.reshape(-1, 2)
+        links.append(np.unique(faces[(faces >= 0).all(1)], axis=0))
     return Matter(
         position=torch.from_numpy(centroid),
         volume=torch.from_numpy(count / n**3 * h**3),
         moment=torch.from_numpy(moment),
-        owner=torch.from_numpy(owner.astype(np.int64)),
+        owner=torch.from_numpy(owner[at].astype(np.int64)),
         links=torch.from_numpy(np.concatenate(links).astype(np.int64)),
     )
 

@@ -11,6 +11,7 @@ from physics3d.learning.loss import Chain
 from physics3d.log import Log
 
 SHORT = 1e-3  # of theta: a thousandth of a parameter
+LITTLE = 2e-3  # of the loss: what a step gains at the bottom, where intervals are a hundred times as wide
 
 
 def polish(
@@ -23,7 +24,8 @@ def polish(
     with L_0 the loss where the step begins: the pull to the start is measured by what is left unexplained, and fades
     as that does. Measured by how bad a start was it would hold what the pictures hardly show. m grows by 8, 64, 512 on
     failures in a row and falls by 4 on success. It is the same for all components, so that one which the pictures
-    hardly show moves least. A step too short to matter ends it. Returns theta and where it was after every step.
+    hardly show moves least. A step too short to matter, or that gains too little, ends it. Returns theta and where it
+    was after every step.
     """
     now, m, grows = chain.measure(theta, seed), 1e-3, 8
     around, course = None, []
@@ -44,5 +46,7 @@ def polish(
         else:
             m, grows = m * grows, 8 * grows
         course.append(Point(way="polish", theta=theta, loss=now))
+        if 0 < gained < LITTLE * now:
+            break
     log.info(f"polished: loss {now:.5g}")
     return theta, course
