@@ -261,7 +261,7 @@ ZERO_IS_FINE = re.compile(
 )
 ENDLESS = re.compile(r"(shear|bulk)_relaxation_time(_[23])?$")
 NULL_IS_FINE = re.compile(
-    r"(resolution|sheet_thickness|learn\.(duration|frames)|floaters|variant|simulate\.force|render\.view|world\.(dt|checkpoint_bytes)|"
+    r"(resolution|sheet_thickness|learn\.(duration|frames|steps)|floaters|variant|simulate\.force|render\.view|world\.(dt|checkpoint_bytes)|"
     r"prompts\.\d\.box|veins)$"
 )
 WORD_IS_FINE = re.compile(r"(capture\.clip|prompts\.\d\.view|render\.view|prior\.weights)$")

@@ -63,3 +63,32 @@ def test_blocks_keep_moments_and_do_not_close_gaps():
     links = blocks.links.numpy()
     assert (above[links[:, 0]] == above[links[:, 1]]).all() and len(links)
     assert len(set(blocks.owner.tolist())) == len(blocks.owner)
+
+
+@pytest.mark.parametrize("shift", np.linspace(0, 1, 7))
+@pytest.mark.parametrize("wide", [0.3, 0.05])
+def test_a_gap_narrower_than_a_cell_stays_a_gap(shift, wide):
+    """Two plates 5 mm apart, wherever the cells of 10 mm lie: no piece and no link has to do with both. Small plates
+    have eighths for pieces, wide ones whole cells."""
+    spacing, thick, gap = 0.01, 0.008, 0.005
+    low = shift * spacing
+
+    def inside(x: np.ndarray) -> np.ndarray:
+        z = x[:, 2] - low
+        across = (np.abs(x[:, :2]) < wide / 2).all(1)
+        return across & (((z > 0) & (z < thick)) | ((z > thick + gap) & (z < 2 * thick + gap)))
+
+    # corners that do not move with the plates, so that these lie anywhere in the lattice
+    corners = np.array([[-wide / 2, -wide / 2, 0.0], [wide / 2, wide / 2, 4 * spacing]])
+    flat = np.stack(np.meshgrid(*[np.linspace(-wide / 2, wide / 2, round(wide / spacing) * 2 + 1)] * 2), -1)
+    faces = np.array([0, thick, thick + gap, 2 * thick + gap]) + low
+    surface = [np.insert(flat.reshape(-1, 2), 2, face, axis=1) for face in faces]
+    *_, matter = solid_cells(inside, np.concatenate([corners, *surface]), spacing)
+    z, half = matter.position[:, 2].numpy() - low, np.sqrt(3 * matter.moment[:, 2, 2].numpy())
+    upper = z > thick + gap / 2
+    # samples are a quarter of a piece apart, and a piece is as much wider or narrower
+    slack = spacing / 8 + 1e-9
+    assert (z[upper] - half[upper] > thick + gap - slack).all() and (z[~upper] + half[~upper] < thick + slack).all()
+    links = matter.links.numpy()
+    assert len(links) and (upper[links[:, 0]] == upper[links[:, 1]]).all()
+    assert matter.volume.sum() == pytest.approx(2 * thick * wide**2, rel=0.1)
