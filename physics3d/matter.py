@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy import ndimage, sparse
 from scipy.spatial import cKDTree
 from torch import Tensor
@@ -93,10 +93,9 @@ def of_samples(
     some = inside.any(1)
     cell, inside, owner = cell[some], inside[some], owner[some]
     n = round(len(offset) ** (1 / 3))
-    # what hangs together within a cell: samples of neighbouring parts, none of them across the first axis
-    near = np.zeros((3, 3, 3, 3), int)
-    near[1] = 1
-    number = ndimage.label(inside.reshape(-1, n, n, n), near)[0].reshape(len(cell), -1) - 1  # of the piece, -1: none
+    number = _lumps(cell, inside.reshape(-1, n, n, n))
+    links = _touching(cell, number)
+    number = number.reshape(len(cell), -1)
     which, lump = np.nonzero(number >= 0)[0], number[number >= 0]
     _, first = np.unique(lump, return_index=True)
     at = which[first]  # the cell of every piece
@@ -111,26 +110,55 @@ def of_samples(
     moment += (1 / n**2 / 12 / count)[:, None, None] * np.eye(3) * (count < n**3)[:, None, None]
     moment += (count / n**3)[:, None, None] * short
     moment, centroid = h**2 * moment, origin + h * (cell[at] + mean)
-    # neighbours share a face on which both have matter
-    piece = number.reshape(-1, n, n, n)
-    size = cell.max(0, initial=0) + 2
-    key = (cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2]
-    order = np.argsort(key)
-    links = []
-    for axis, step in enumerate((size[1] * size[2], size[2], 1)):
-        there = np.minimum(np.searchsorted(key[order], key + step), len(key) - 1)
-        first = np.flatnonzero(key[order[there]] == key + step)
-        second = order[there[first]]
-        faces = np.stack([np.take(piece[first], n - 1, axis + 1), np.take(piece[second], 0, axis + 1)], -1)
-        faces = faces.reshape(-1, 2)
-        links.append(np.unique(faces[(faces >= 0).all(1)], axis=0))
     return Matter(
         position=torch.from_numpy(centroid),
         volume=torch.from_numpy(count / n**3 * h**3),
         moment=torch.from_numpy(moment),
         owner=torch.from_numpy(owner[at].astype(np.int64)),
-        links=torch.from_numpy(np.concatenate(links).astype(np.int64)),
+        links=torch.from_numpy(links),
     )
+
+
+def _lumps(cell: Int[np.ndarray, "m 3"], inside: Bool[np.ndarray, "m n n n"]) -> Int[np.ndarray, "m n n n"]:
+    """The number of the piece that every sample belongs to, -1 for none: what hangs together within a cell, and what
+    does so by way of the cells around it. What is left apart lies to both sides of a gap."""
+    near = np.zeros((3, 3, 3, 3), int)
+    near[1] = 1  # neighbouring samples, none of them across the first axis
+    number, count = ndimage.label(inside, near)
+    number -= 1
+    links = _touching(cell, number)
+    graph = sparse.coo_matrix((np.ones(len(links), bool), links.T), shape=(count, count))
+    graph = ((graph + graph.T).astype(bool) + sparse.identity(count, dtype=bool)).tocsr()
+    around = (graph @ graph).astype(bool)
+    around = (around @ around).astype(bool)  # four links: around an edge, or along a wall that a cell meets twice
+    own = np.full(count, -1)
+    at = np.nonzero(number >= 0)
+    own[number[at]] = at[0]
+    i, j = around.nonzero()
+    same = own[i] == own[j]
+    graph = sparse.coo_matrix((np.ones(same.sum(), bool), (i[same], j[same])), shape=(count, count))
+    _, piece = sparse.csgraph.connected_components(graph, directed=False)
+    return np.where(number >= 0, piece[number], -1)
+
+
+def _touching(cell: Int[np.ndarray, "m 3"], number: Int[np.ndarray, "m n n n"]) -> Int[np.ndarray, "l 2"]:
+    """Pairs of pieces of neighbouring cells that have samples to both sides of their face, beside each other: a sample
+    touches those around its neighbour too, for a thin wall that runs askew is no row of gaps."""
+    n = number.shape[1]
+    size = cell.max(0, initial=0) + 2
+    key = (cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2]
+    order = np.argsort(key)
+    links = [np.zeros((0, 2), np.int64)]
+    for axis, step in enumerate((size[1] * size[2], size[2], 1)):
+        there = np.minimum(np.searchsorted(key[order], key + step), len(key) - 1)
+        first = np.flatnonzero(key[order[there]] == key + step)
+        second = order[there[first]]
+        mine, other = np.take(number[first], n - 1, axis + 1), np.take(number[second], 0, axis + 1)
+        other = np.pad(other, ((0, 0), (1, 1), (1, 1)), constant_values=-1)
+        for i, j in np.ndindex(3, 3):
+            pairs = np.stack([mine, other[:, i : i + n, j : j + n]], -1).reshape(-1, 2)
+            links.append(np.unique(pairs[(pairs >= 0).all(1)], axis=0))
+    return np.unique(np.concatenate(links), axis=0).astype(np.int64)
 
 
 def in_one_piece(matter: Matter) -> Matter:
