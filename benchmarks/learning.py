@@ -6,9 +6,9 @@
 Every run has a body and a material of its own (`learning_twins.py`), and starts a factor 10 off in stiffness and 5 in
 the relaxation time, with noise on every pixel and a density that is wrong by about 10 %. It goes through the stages of
 the pipeline from the filling on: fill, learn, simulate and render the push that was held out. The Gaussians are the
-twin's own, on its true surface, for reconstruction is slow; what is filled into them swings 1 to 4 % too fast, the cord
-a fifth, and `learn.beyond.surface` is 0.05 here. Every run is in the
-table, the best and the worst. Then truth that the learner was handed is taken away, one thing at a time.
+twin's own, on its true surface, for reconstruction is slow; what is filled into them swings 1 to 4 % too fast, and
+`learn.beyond.surface` is 0.05 here. Every run is in the table, the best and the worst. Then truth that the learner was
+handed is taken away, one thing at a time.
 
 A run that is done stands in the .csv and is not done again, so this may be stopped at any time; remove the file to
 begin anew. Times are processor time of one thread, for the machine is shared.
