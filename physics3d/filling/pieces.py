@@ -22,9 +22,9 @@ def join_pieces(
     """(particles to keep [p] bool, positions of new ones [b, 3], their part [b]); every piece is in the log.
 
     Pieces lie more than two spacings (a cell) apart. Those below `drop_below` of the volume are dropped, which is said
-    of all of them in one line, and so are all
-    but the largest if `isolated` is "drop"; their Gaussians ride on what remains. "attach" bridges a gap of at most
-    JOINT spacings to a piece of the same part by particles a spacing apart; wider ones stay, as with "keep".
+    of all of them in one line, and so are all but the largest if `isolated` is "drop"; their Gaussians ride on what
+    remains. "attach" bridges a gap of at most JOINT spacings to a piece of the same part by particles a spacing apart;
+    wider ones stay, as with "keep".
     """
     piece = clusters(position, 2 * spacing)
     count = int(piece.max()) + 1

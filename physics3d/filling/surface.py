@@ -5,7 +5,7 @@
                stands on or leans against hides the sky)
     thin       both sides see the sky alike (a petal, a leaf); such samples bound no volume
     place      where the photographs' cameras see the surface (`seen.py`), and not below what the body stands on
-               (`ground.py`); without cameras a deviation outside the Gaussians' centres
+               (`ground.py`), into which its sides go on; without cameras a deviation outside the Gaussians' centres
 
 All lengths in metres.
 """
@@ -186,7 +186,8 @@ def _ends_below(view: Seen, below: Ground, spacing: float) -> tuple[np.ndarray, 
 def _sides_below(
     point: np.ndarray, normal: np.ndarray, view: Seen, below: Ground, spacing: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Down to these ends the sides go on as they are seen above the ground: samples and normals.
+    """Down to these ends the sides go on as they are seen above the ground: samples [k, 3] [m] and outward normals,
+    of those of solid parts that were found.
 
     Else the body would be rounded off where it is held: a stem whose section shrinks to a third on its way into the
     soil bends there.

@@ -39,7 +39,7 @@ def reaches(
     """(`told`, reaching as far along each direction as the loss allows; the lowest place that is clearly lower).
 
     `before`: widths of what was thought beforehand, beyond which nobody looks; `rise`: R of a d; `loss`: L at
-    theta_hat + d. Where a lower place is found the reaches are not to be used.
+    theta_hat + d. Where a lower place is found the reaches are those around an answer that is not the best.
     """
     middle, deviation = told.middle.copy(), told.deviation.copy()
     here = loss(np.zeros(len(before)))
