@@ -99,7 +99,7 @@ reference-motion: $(ready) ## how a twin moves by finite elements, kept for its 
 train-prior: $(ready) ## a small video model from films it makes; goes on where it was: [OUT=outputs/tiny_video] [ARGS="steps=... seed=0 device=cpu"]
 	@$(threads) $(with_args) -m pipeline.train_prior
 
-export: $(ready) ## the moving Gaussians for other programs: FORMAT=ply|usd|gltf [OUT=<new folder>] [FRAME=<of gltf>]
+export: $(ready) ## the moving Gaussians for other programs: FORMAT=ply|usd|gltf|spz [OUT=<new folder>] [FRAME=<of gltf, spz>]
 	@$(threads) $(with_args) -m pipeline.export $(of_run)
 
 still: $(ready) ## the picture to hand to an image-to-video model: [OUT=<new .png>] [SIZE=1024x576]; then capture.clip=<its clip>

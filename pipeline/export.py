@@ -1,8 +1,9 @@
-"""make export SCENE=... FORMAT=ply|usd|gltf [OUT=<new folder>] [FRAME=<number>]: moving Gaussians for other programs.
+"""make export SCENE=... FORMAT=ply|usd|gltf|spz [OUT=<new folder>] [FRAME=<number>]: motion for other programs.
 
     ply    frame0000.ply, frame0001.ply, ...: SuperSplat plays the folder
     usd    <scene>.usdc: OpenUSD's Gaussian splats with time samples, the particles, the material
     gltf   <scene>.glb: one frame (FRAME, else 0), KHR_gaussian_splatting
+    spz    <scene>.spz: one frame (FRAME, else 0), a tenth as large
 
 The words of `make run` say of which scene; FORMAT, OUT and FRAME come by way of the environment. What it will take on
 the disk is said first; the folder gets its name when everything is in it. Exit codes: 0 done, 1 nothing to export or no
@@ -17,11 +18,9 @@ from pathlib import Path
 from pipeline.filed import beside, megabytes, one_line
 from pipeline.settings import SettingsError
 
-FORMATS = ("ply", "usd", "gltf")
+FORMATS = ("ply", "usd", "gltf", "spz")
 USAGE = f"make export SCENE=<scene> FORMAT={'|'.join(FORMATS)} [OUT=<new folder>]"
-NO_SPZ = (
-    "FORMAT=spz: no package that writes .spz can be installed here; take FORMAT=ply, and convert it (docs/blender.md)"
-)
+ONE_FRAME = ("gltf", "spz")
 
 
 def main(words: list[str], environment: Mapping[str, str]) -> int:
@@ -31,8 +30,6 @@ def main(words: list[str], environment: Mapping[str, str]) -> int:
 def export(words: list[str], environment: Mapping[str, str]) -> None:
     """Raises SettingsError, StageError, ValueError, RuntimeError or OSError with one line."""
     kind, frame = environment.get("FORMAT", ""), environment.get("FRAME") or "0"
-    if kind == "spz":
-        raise SettingsError(NO_SPZ)
     if kind not in FORMATS:
         raise SettingsError(f"FORMAT={kind}: take one of {', '.join(FORMATS)}; {USAGE}")
     if not frame.isdecimal():
@@ -41,6 +38,7 @@ def export(words: list[str], environment: Mapping[str, str]) -> None:
     from physics3d.export.gltf import glb_size, write_glb
     from physics3d.export.moving import Moving
     from physics3d.export.ply import ply_size, write_ply_sequence
+    from physics3d.export.spz import spz_size, write_spz
     from physics3d.export.usd import usd_size, write_usd
     from physics3d.log import Log
     from pipeline.moving import scene_motion
@@ -53,8 +51,9 @@ def export(words: list[str], environment: Mapping[str, str]) -> None:
         "ply": lambda: ply_size(moving),
         "usd": lambda: usd_size(moving, body),
         "gltf": lambda: glb_size(moving.count, moving.harmonics),
+        "spz": lambda: spz_size(moving.count, moving.harmonics),
     }[kind]()
-    frames = f"frame {int(frame)}" if kind == "gltf" else f"{len(moving)} frames at {trajectory.fps:g} per second"
+    frames = f"frame {int(frame)}" if kind in ONE_FRAME else f"{len(moving)} frames at {trajectory.fps:g} per second"
     print(f"writing   {frames} of {moving.count} Gaussians, at most {megabytes(size)}, into {target}", flush=True)
     with beside(target, size) as folder:
         folder.mkdir()
@@ -63,8 +62,10 @@ def export(words: list[str], environment: Mapping[str, str]) -> None:
         elif kind == "usd":
             log = Log(folder.parent, name="export")
             write_usd(folder / f"{name}.usdc", moving, body, made.world, made.estimate.parameters, log=log)
-        else:
+        elif kind == "gltf":
             write_glb(folder / f"{name}.glb", moving.frame(int(frame)))
+        else:
+            write_spz(folder / f"{name}.spz", moving.frame(int(frame)))
         files = [file for file in folder.iterdir() if file.is_file()]
         written = sum(file.stat().st_size for file in files)
     print(f"written   {target}   {len(files)} file{'s' * (len(files) > 1)}, {megabytes(written)}")

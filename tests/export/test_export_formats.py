@@ -1,5 +1,6 @@
 """Every format, read back by a reader that is not ours, holds the numbers of the frame."""
 
+import gzip
 import math
 
 import numpy as np
@@ -10,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from physics3d.export.gltf import glb_size, write_glb
 from physics3d.export.ply import ply_size, write_ply_sequence
+from physics3d.export.spz import spz_size, write_spz
 from physics3d.export.usd import usd_size, write_usd
 from physics3d.log import Log
 
@@ -169,3 +171,78 @@ def test_glb_holds_a_frame_with_y_up(tmp_path, k):
         band = slice(degree**2, (degree + 1) ** 2)
         length = lambda c, band=band: (c[:, band] ** 2).sum(1)
         np.testing.assert_allclose(length(sh), length(g.sh.numpy()), rtol=1e-5, atol=1e-5)
+
+
+def unpacked(path) -> dict[str, np.ndarray]:
+    """An .spz of version 3, by the formulas of the reference reader (nianticlabs/spz, load-spz.cc: unpackGaussian,
+    unpackQuaternionSmallestThree, inverse of the colour scale), written out here."""
+    raw = gzip.decompress(path.read_bytes())
+    magic, version, count = np.frombuffer(raw, "<u4", 3)
+    degree, fraction, flags, reserved = raw[12:16]
+    assert (magic, version, flags, reserved) == (0x5053474E, 3, 0, 0)
+    rest = {0: 0, 1: 3, 2: 8, 3: 15}[degree]
+    at, column = 16, {}
+    for name, width in (("mean", 9), ("opacity", 1), ("dc", 3), ("scale", 3), ("turn", 4), ("rest", 3 * rest)):
+        column[name] = np.frombuffer(raw, np.uint8, count * width, at).reshape(count, width)
+        at += count * width
+    assert at == len(raw)
+    low, middle, high = (column["mean"].reshape(count, 3, 3)[:, :, k].astype(int) for k in range(3))
+    fixed = low + 256 * middle + 65536 * high
+    mean = np.where(fixed >= 2**23, fixed - 2**24, fixed) / 2**fraction
+    quaternion = np.zeros((count, 4))  # x y z w
+    for i, word in enumerate(column["turn"].copy().view("<u4")[:, 0].tolist()):
+        largest, left = word >> 30, 1.0
+        for axis in reversed(range(4)):
+            if axis != largest:
+                sign = -1 if word >> 9 & 1 else 1
+                quaternion[i, axis] = sign * 0.5**0.5 * (word & 511) / 511
+                left -= quaternion[i, axis] ** 2
+                word >>= 10
+        quaternion[i, largest] = max(left, 0) ** 0.5
+    dc = (column["dc"] / 255 - 0.5) / 0.15
+    sh = np.concatenate([dc[:, None], (column["rest"].reshape(count, rest, 3) - 128.0) / 128], 1)
+    opacity, log_scale = column["opacity"][:, 0] / 255, column["scale"] / 16 - 10
+    return {"mean": mean, "opacity": opacity, "log_scale": log_scale, "xyzw": quaternion, "sh": sh}
+
+
+@pytest.mark.parametrize("k", HARMONICS)
+def test_spz_holds_a_frame_with_y_up(tmp_path, k):
+    made, _ = moving(k)
+    g = made.frame(FRAMES - 1)
+    path = tmp_path / "out" / "thing.spz"
+    write_spz(path, g)
+    assert path.stat().st_size <= spz_size(made.count, k)
+    read = unpacked(path)
+    y_up = Rotation.from_euler("x", -90, degrees=True)
+    # half a step of what is stored, and float32's rounding on the way: 20 bits of fraction, bytes, 9 bits of 1/sqrt(2)
+    np.testing.assert_allclose(read["mean"], y_up.apply(g.mean.numpy()), atol=2**-21 + 1e-6)
+    np.testing.assert_allclose(read["opacity"], g.opacity, atol=0.5 / 255 + 1e-6)
+    inside = g.log_scale.clamp(-10, 255 / 16 - 10)
+    np.testing.assert_allclose(read["log_scale"], inside, atol=0.5 / 16 + 1e-6)
+    same = y_up * Rotation.from_quat(g.quaternion.numpy()[:, [1, 2, 3, 0]])
+    # three components, each half a step off, and the fourth that follows from them: at most four of these steps
+    assert (Rotation.from_quat(read["xyzw"]) * same.inv()).magnitude().max() < 8 * 0.5 * 0.5**0.5 / 511
+    # degree 0 does not turn; of degree 1, whose harmonics are ~ (-y, z, -x), (x, y, z) -> (x, z, -y) makes this
+    np.testing.assert_allclose(
+        read["sh"][:, 0], g.sh[:, 0].clamp(-0.5 / 0.15, 0.5 / 0.15), atol=0.5 / 255 / 0.15 + 1e-6
+    )
+    assert read["sh"].shape[1] == k
+    if k > 1:
+        along_y, along_z, along_x = (g.sh[:, j].clamp(-1, 127 / 128) for j in (1, 2, 3))
+        for j, expected in ((1, -along_z), (2, along_y), (3, along_x)):
+            np.testing.assert_allclose(read["sh"][:, j], expected, atol=1.5 / 128)
+
+
+def test_spz_refuses_what_lies_too_far_for_its_numbers(tmp_path):
+    from dataclasses import replace
+
+    g = moving(1)[0].frame(0)
+    for far, fits in ((1e6, True), (5e6, False)):
+        mean = g.mean.clone()
+        mean[0, 0] = far
+        if fits:
+            write_spz(tmp_path / "far.spz", replace(g, mean=mean))
+            assert unpacked(tmp_path / "far.spz")["mean"][0, 0] == pytest.approx(far, abs=0.5)
+            continue
+        with pytest.raises(ValueError, match="take FORMAT=ply"):
+            write_spz(tmp_path / "too_far.spz", replace(g, mean=mean))

@@ -38,7 +38,10 @@ def nothing_else(folder, *names):
     assert sorted(os.listdir(folder)) == sorted(names)
 
 
-@pytest.mark.parametrize("kind, suffix, count", [("ply", ".ply", FRAMES), ("usd", ".usdc", 1), ("gltf", ".glb", 1)])
+@pytest.mark.parametrize(
+    "kind, suffix, count",
+    [("ply", ".ply", FRAMES), ("usd", ".usdc", 1), ("gltf", ".glb", 1), ("spz", ".spz", 1)],
+)
 def test_every_format_goes_into_its_folder(command, tmp_path, kind, suffix, count):
     out = tmp_path / "new" / "it's here"
     code, said, wrong = command(export, FORMAT=kind, OUT=out)
@@ -62,8 +65,8 @@ def test_a_frame_of_the_sequence_is_a_model_that_the_project_reads(command, tmp_
 @pytest.mark.parametrize(
     "environment, code, message",
     [
-        ({"FORMAT": "obj"}, 2, "FORMAT=obj: take one of ply, usd, gltf"),
-        ({"FORMAT": "spz"}, 2, "FORMAT=spz: no package"),
+        ({"FORMAT": "obj"}, 2, "FORMAT=obj: take one of ply, usd, gltf, spz"),
+        ({"FORMAT": "spz", "FRAME": "5"}, 1, "there is no frame 5; take one of 0 to 4"),
         ({"FORMAT": "gltf", "FRAME": "five"}, 2, "FRAME=five is no number"),
         ({"FORMAT": "gltf", "FRAME": "5"}, 1, "there is no frame 5; take one of 0 to 4"),
     ],
