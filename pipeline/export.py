@@ -15,7 +15,7 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
-from pipeline.filed import beside, megabytes, one_line
+from pipeline.filed import beside, megabytes, one_line, vacant
 from pipeline.settings import SettingsError
 
 FORMATS = ("ply", "usd", "gltf", "spz")
@@ -47,6 +47,7 @@ def export(words: list[str], environment: Mapping[str, str]) -> None:
     name, body, trajectory = made.scene, made.body, made.trajectory
     moving = Moving(gaussians=made.gaussians, embedding=body.embedding, trajectory=trajectory, interior=made.interior)
     target = Path(environment.get("OUT") or f"exports/{name}_{kind}")
+    vacant(target)
     size = {
         "ply": lambda: ply_size(moving),
         "usd": lambda: usd_size(moving, body),

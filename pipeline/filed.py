@@ -65,6 +65,12 @@ def one_line(run: Callable[[], None], error: Callable[[str], None]) -> int:
     return 0
 
 
+def vacant(target: Path) -> None:
+    """Raises FileExistsError if something is there already."""
+    if os.path.lexists(target):
+        raise FileExistsError(f"{target} is there already; remove it, or say OUT=<another place>")
+
+
 @contextmanager
 def beside(target: Path, size: int = 0, over: bool = False) -> Iterator[Path]:
     """A hidden path beside `target` to write a file or a folder at; it gets its name when all of it is there.
@@ -72,8 +78,8 @@ def beside(target: Path, size: int = 0, over: bool = False) -> Iterator[Path]:
     `size` [byte] of what will be written; `over`: a file that is there is replaced. Raises FileExistsError if `target`
     is there already, OSError if the disk has not as much room; whatever goes wrong, nothing half-written is left.
     """
-    if os.path.lexists(target) and not over:
-        raise FileExistsError(f"{target} is there already; remove it, or say OUT=<another place>")
+    if not over:
+        vacant(target)
     target.parent.mkdir(parents=True, exist_ok=True)
     free = shutil.disk_usage(target.parent).free
     if size > free:

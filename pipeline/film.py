@@ -1,18 +1,21 @@
 """make film SCENE=... [OUT=film.mp4] [SIZE=1280x720] [LENGTH=...]: the motion, seen from a camera that goes round it.
 
-The words of `make run` say of which scene; OUT, SIZE and LENGTH come by way of the environment. Without LENGTH the film
-lasts as long as the motion. Exit codes: 0 done, 1 it could not be made, 2 a word means nothing, 130 Ctrl-C.
+The words of `make run` say of which scene; OUT, SIZE and LENGTH come by way of the environment. Without LENGTH the
+camera goes round in six seconds or a little more, in which the motion is played whole times. Exit codes: 0 done, 1 it
+could not be made, 2 a word means nothing, 130 Ctrl-C.
 """
 
+import math
 import os
 import re
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 
-from pipeline.filed import beside, megabytes, one_line
+from pipeline.filed import beside, megabytes, one_line, vacant
 from pipeline.settings import SettingsError
 
+ROUND = 6.0  # once round in less makes people dizzy [s]
 LARGEST = 8192  # side of a film that players take [px]
 
 
@@ -36,8 +39,10 @@ def film(words: list[str], environment: Mapping[str, str]) -> None:
     made = scene_motion(words)
     place = device(made.device)
     trajectory, fps = made.trajectory, made.trajectory.fps
-    count = len(trajectory.position) if seconds is None else max(1, round(seconds * fps))
+    once = len(trajectory.position)
+    count = once * math.ceil(ROUND * fps / once) if seconds is None else max(1, round(seconds * fps))
     target = Path(environment.get("OUT") or f"exports/{made.scene}_turntable.mp4")
+    vacant(target)
     table = Turntable(width=width, height=height, frames=count)
     log = Log(target.parent, name="film")
     print(f"writing   {count} frames of {width} x {height} px at {fps:g} per second, into {target}", flush=True)

@@ -80,8 +80,8 @@ def test_what_cannot_be_exported_is_one_line(command, tmp_path, environment, cod
 @pytest.mark.parametrize("module, name", [(export, "out"), (film, "out.mp4")])
 def test_what_is_there_already_is_kept(command, tmp_path, module, name):
     (tmp_path / name).write_text("mine")
-    code, _, wrong = command(module, FORMAT="gltf", OUT=tmp_path / name)
-    assert code == 1 and "is there already" in wrong and wrong.count("\n") == 1
+    code, said, wrong = command(module, FORMAT="gltf", OUT=tmp_path / name)
+    assert code == 1 and not said and "is there already" in wrong and wrong.count("\n") == 1
     assert (tmp_path / name).read_text() == "mine"
     nothing_else(tmp_path, name)
 
@@ -120,6 +120,13 @@ def test_a_film_has_the_size_and_the_length_that_were_asked_for(command, tmp_pat
     assert frames.shape == (12, 48, 64, 3) and fps == pytest.approx(FPS)
     assert frames.float().std() > 5  # something is in the picture
     nothing_else(tmp_path, "a.mp4")
+
+
+def test_a_film_goes_round_slowly_and_ends_where_a_motion_ends(command, tmp_path):
+    code, _, wrong = command(film, OUT=tmp_path / "a.mp4", SIZE="64x48")
+    assert (code, wrong) == (0, "")
+    frames, _ = read_mp4(tmp_path / "a.mp4")
+    assert len(frames) % FRAMES == 0 and 0 <= len(frames) - 6 * FPS < FRAMES
 
 
 @pytest.mark.parametrize(
