@@ -2,7 +2,7 @@
 
     make bench-mlflow_picture   ->   docs/results/mlflow.jpg
 
-Shows what this folder has recorded; run some variants first (`make compare`, `make sweep`).
+Shows what this folder has recorded, of its charts those of SHOWN; run some variants first (`make compare`, `make sweep`).
 """
 
 import socket
@@ -20,8 +20,12 @@ from pipeline.tracking import address, database
 TARGET = Path(__file__).resolve().parent.parent / "docs" / "results" / "mlflow.jpg"
 PATIENCE = 180.0  # [s] for MLflow on a busy machine
 DRAWN = 30.0  # [s] for its charts
-# whatever helper has opened at the side
-CLOSE = 'document.querySelectorAll(\'[aria-label="Close"], [aria-label="close"]\').forEach(b => b.click())'
+SHOWN = "score/learned/(psnr|motion_psnr|flow_error)|^learned/youngs"  # names of charts
+WIDTH, HEIGHT = 1500, 1240  # of the window [px]
+NO_ASSISTANT = "localStorage['mlflow.assistant.panelOpen_v1'] = 'false'; location.reload()"  # it covers the charts
+NO_SIDEBAR = "document.querySelector('[aria-label=\"Toggle sidebar\"]').click()"
+NO_TOOLS = """document.head.insertAdjacentHTML('beforeend', '<style>.modebar {display: none}</style>');
+document.querySelector('[placeholder=\"Search metric charts\"]').focus()"""
 
 
 def main() -> None:
@@ -39,11 +43,15 @@ def main() -> None:
             wait(port)
             with (
                 tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder,
-                opened(address(home, port), Path(folder), width=1500, height=1000) as tab,
+                opened(address(home, port), Path(folder), width=WIDTH, height=HEIGHT) as tab,
             ):
                 time.sleep(DRAWN)
-                tab.evaluate(CLOSE)
-                time.sleep(5.0)
+                tab.evaluate(NO_ASSISTANT)
+                time.sleep(DRAWN)
+                tab.evaluate(NO_SIDEBAR)
+                tab.evaluate(NO_TOOLS)
+                tab.call("Input.insertText", text=SHOWN)
+                time.sleep(DRAWN / 3)
                 picture = Image.fromarray(tab.picture())
         finally:
             ui.terminate()

@@ -89,6 +89,7 @@ def _entry(key: str, below: set[str], told: Manifests, shelf: Path, names: dict[
         "scene": label.get("scene") or peek(shelf / "capture" / stage["capture"])["name"],
         "method": label.get("method", "?"),
         "profile": label.get("profile", "?"),
+        "said": " ".join(filter(None, (label.get("said", ""), _seed(label.get("seed", "0"))))),
         "material": world.get("material", {}).get("_target_", "?").rpartition(".")[2],
         "seconds": sum(told[k]["seconds"] for k in below),
         "finished": told[key]["finished"],
@@ -97,6 +98,10 @@ def _entry(key: str, below: set[str], told: Manifests, shelf: Path, names: dict[
         "picture": picture(sheet, SHOWN) if sheet else None,
         "shows": sheet.stem.replace("_", " ") if sheet else "",
     }
+
+
+def _seed(seed: str) -> str:
+    return "" if seed == "0" else f"seed={seed}"
 
 
 def judged(folder: Path) -> dict[str, dict[str, float | None]]:

@@ -314,11 +314,12 @@ def git_commit(root: Path) -> str:
 
 
 def labels(output: Path) -> dict[str, dict[str, str]]:
-    """artifacts/<stage>/<fingerprint> -> scene, method, profile of the newest run that had it; none without record."""
+    """artifacts/<stage>/<fingerprint> -> scene, method, profile, seed and what else was said (`said`) of the newest run
+    that had it; none without record."""
     query = "select art.value, tag.key, tag.value from tags art join tags parent on parent.run_uuid = art.run_uuid "
     query += "join tags tag on tag.run_uuid = parent.value join runs on runs.run_uuid = parent.value "
     query += "where art.key = 'artifact' and parent.key = 'mlflow.parentRunId' "
-    query += "and tag.key in ('scene', 'method', 'profile') order by runs.start_time"
+    query += "and tag.key in ('scene', 'method', 'profile', 'seed', 'said') order by runs.start_time"
     found: dict[str, dict[str, str]] = {}
     try:
         with closing(_connect(output.resolve() / "mlflow.db", "ro")) as record:

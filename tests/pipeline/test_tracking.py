@@ -17,7 +17,7 @@ from PIL import Image
 import pipeline.live
 from physics3d.log import Log
 from pipeline.stage import Filed, Step
-from pipeline.tracking import EXPERIMENT, Tracking, _process, address, free_port, mend
+from pipeline.tracking import EXPERIMENT, Tracking, _process, address, free_port, labels, mend
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 OPEN = """
@@ -160,7 +160,7 @@ def test_a_port_that_is_taken_is_one_line(folder):
     assert free_port(str(port)) == port and str(port) in address(folder, port)
 
 
-def run_of(folder: Path, modulus: float, psnr: float, hit: bool = False) -> Tracking:
+def run_of(folder: Path, modulus: float, psnr: float, hit: bool = False, said: str = "") -> Tracking:
     """The record of a run whose steps are a learned material and a film of it."""
     steps = []
     learned = ["fields.json", "previews/parameters.png", "previews/loss_00003.png"]
@@ -173,7 +173,8 @@ def run_of(folder: Path, modulus: float, psnr: float, hit: bool = False) -> Trac
             else:
                 (step.folder / file).write_text("x")
         steps.append(Filed(step, hit, {"seconds": 3.0, "peak_rss_bytes": 1}))
-    made = Tracking(folder, config={"seed": 1}, name="ball physics3d seed 1 learn.steps=2", tags={"scene": "ball"})
+    tags = {"scene": "ball", "said": said}
+    made = Tracking(folder, config={"seed": 1}, name="ball physics3d seed 1 learn.steps=2", tags=tags)
     for filed in steps:
         made.stage(filed)
     scores = {"learned/youngs_modulus": modulus, "score/learned/psnr": psnr, "score/initial/psnr": 9.0}
@@ -199,6 +200,14 @@ def test_materials_of_all_runs_can_be_put_in_an_order_also_after_a_move(folder, 
     assert filed == ["artifacts/learn/300000", "artifacts/learn/200000", "artifacts/learn/100000"]
     assert best.tags["scene"] == "ball" and best.artifact_location.startswith(moved.as_uri())
     assert [p.name for p in (moved / "mlartifacts").rglob("fields.json")] == ["fields.json"] * 3
+
+
+def test_a_result_is_labelled_with_what_was_said_of_its_run(folder):
+    for modulus, said in ((1e5, ""), (2e5, "learn.search=3 material=elastic")):
+        run_of(folder, modulus, 20.0, said=said)
+    found = labels(folder)
+    assert found["artifacts/render/100000"] == {"scene": "ball", "said": ""}
+    assert found["artifacts/render/200000"] == {"scene": "ball", "said": "learn.search=3 material=elastic"}
 
 
 def test_parents_say_what_was_reused_how_long_it_took_and_show_it(folder):
