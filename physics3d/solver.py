@@ -114,7 +114,9 @@ def motion_of(
     why = "world.solver says so"
     if world.solver != "grid":
         try:
-            chosen = _modes(world, position, volume, excitation, part, matter, log)
+            chosen = modes_of(
+                world, position, volume, excitation=excitation, part=part, matter=matter, most=MOST_PIECES, log=log
+            )
             if world.solver == "auto":
                 why = "the body touches nothing and comes back to its shape"
         except Refused as reason:
@@ -127,20 +129,23 @@ def motion_of(
     )
 
 
-def _modes(
+def modes_of(
     world: World,
     position: Tensor,
     volume: Tensor,
+    *,
     excitation: tuple[AbstractBoundary, ...],
     part: Callable[[Values], Values],
     matter: Matter | None,
+    most: int,
     log: Log,
 ) -> modes.Solver:
-    """Raises Refused where the grid is needed."""
+    """The solver without a grid, arguments as of `motion_of`, for a body of `most` particles at most. Raises Refused
+    with the reason where it does not serve."""
     if not world.material.recovers:
         raise Refused(f"the material ({type(world.material).__name__}) may flow")
-    if len(position) > MOST_PIECES:
-        raise Refused(f"{len(position)} particles are more than {MOST_PIECES}")
+    if len(position) > most:
+        raise Refused(f"{len(position)} particles are more than {most}")
     start = part({name: torch.tensor(value, dtype=torch.float64) for name, value in world.start.items()})
     _refuse_a_fall(world, excitation)
     found = modes.Solver.of(

@@ -7,7 +7,7 @@ short enough to follow the first three modes; where they cannot keep up with the
 
 import math
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -22,7 +22,7 @@ from physics3d.materials.base import Values
 from physics3d.modes.conditions import touched
 from physics3d.modes.dynamics import NotSolved
 from physics3d.modes.stepping import Stepper
-from physics3d.solver import motion_of
+from physics3d.solver import modes_of
 from physics3d.view.poke import Record, place
 from physics3d.view.quantities import Stress
 from physics3d.world import World
@@ -32,6 +32,7 @@ STEPS = 16  # in a period of the last of them: the midpoint rule is then late by
 LONGEST, SHORTEST = 1 / 60, 1 / 480  # [s] of a step
 MOST = 0.1  # of the clock that one call makes up for [s]
 STIFFEST = 0.02  # of the compliance of the softest place: near its hold the body resists no more than that
+MOST_PIECES = 100_000  # particles: modes of 78 000 take a core 50 s, once, and 5 GB; a step of them then takes 3 ms
 STILL = 1e-4  # of its size per second: who moves less for a second has come to rest
 
 
@@ -63,17 +64,16 @@ class Live:
         """At rest. `parameters` with everything that the material has to know of the body. Raises ValueError with the
         reason where the body cannot be pulled at live."""
         part = lambda values: world.material.per_part(values, body.part, body.parts)
-        motion = motion_of(
-            replace(world, solver="modes"), body.position, body.volume,
-            excitation=body.held, part=part, matter=body.matter, device="cpu", log=log,
+        solver = modes_of(
+            world, body.position, body.volume,
+            excitation=body.held, part=part, matter=body.matter, most=MOST_PIECES, log=log,
         )  # fmt: skip
-        assert motion.modes is not None
-        model = motion.modes.model
+        model = solver.model
         if not any(math.isinf(spring.until) for spring in model.springs):
             raise ValueError("nothing holds the body: a poke would carry it away")
         period = 2 * math.pi / float(np.sort(model.omega)[:FOLLOWED].max())
         dt = min(LONGEST, max(SHORTEST, period / STEPS))
-        return cls(Stepper(motion.modes, parameters, dt=dt), body, parameters, damping=world.damping)
+        return cls(Stepper(solver, parameters, dt=dt), body, parameters, damping=world.damping)
 
     @property
     def world(self) -> World:

@@ -121,6 +121,7 @@ def test_where_there_can_be_no_poke_the_reason_is_told(changes, reason):
     with pytest.raises(ValueError, match=reason) as told:
         live(replace(LOOKED.world, **changes))
     assert "\n" not in str(told.value)
+    assert "world.solver" not in str(told.value)  # no other solver pokes
 
 
 @pytest.mark.parametrize("material", RECOVERING, ids=str)
