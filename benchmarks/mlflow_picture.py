@@ -1,8 +1,9 @@
 """MLflow's page that compares runs, as a headless Chromium shows it, for the README.
 
-    make bench-mlflow_picture   ->   docs/results/mlflow.jpg
+    make sweep SCENES=carnation METHODS=physics3d,without_viscoelastic,physgaussian PROFILE=smoke
+    make bench-mlflow_picture [ARGS=<name of the sweep's table>]   ->   docs/results/mlflow.jpg
 
-Shows what this folder has recorded, of its charts those of SHOWN; run some variants first (`make compare`, `make sweep`).
+Shows what this folder has recorded, or one sweep, and of its charts those of SHOWN.
 """
 
 import socket
@@ -28,7 +29,7 @@ NO_TOOLS = """document.head.insertAdjacentHTML('beforeend', '<style>.modebar {di
 document.querySelector('[placeholder=\"Search metric charts\"]').focus()"""
 
 
-def main() -> None:
+def main(words: list[str]) -> None:
     from PIL import Image
 
     if chromium() is None:
@@ -43,7 +44,7 @@ def main() -> None:
             wait(port)
             with (
                 tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder,
-                opened(address(home, port), Path(folder), width=WIDTH, height=HEIGHT) as tab,
+                opened(address(home, port, *words), Path(folder), width=WIDTH, height=HEIGHT) as tab,
             ):
                 time.sleep(DRAWN)
                 tab.evaluate(NO_ASSISTANT)
@@ -73,4 +74,4 @@ def wait(port: int) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])

@@ -307,16 +307,17 @@ def _write(table: Path, rows: list[dict[str, Any]]) -> None:
 
 
 def _show(rows: list[dict[str, Any]]) -> None:
-    """Parameters, and the scores by which materials are compared, variant by variant."""
+    """Parameters, and the scores by which materials are compared, variant by variant; bounds and other scores are in
+    the file, for a table of them all is wider than a screen."""
     from rich import box
     from rich.console import Console
     from rich.table import Table
 
     named = list(dict.fromkeys(key for row in rows for key in row))
-    shown = [key for key in named if not key.startswith("score/") or key.endswith("/psnr")]
+    shown = [key for key in named if not key.startswith(("score/", "learned_")) or key.endswith("/psnr")]
     made = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     for key in shown:
-        made.add_column(key, overflow="fold")
+        made.add_column(key.translate(str.maketrans("/_ ", "\n\n\n")), overflow="fold")
     for row in rows:
         made.add_row(*(f"{v:.4g}" if isinstance(v := row.get(key, ""), float) else str(v) for key in shown))
     Console(highlight=False, width=None if sys.stdout.isatty() else 160).print(made)
