@@ -101,7 +101,9 @@ def solve(
             f"the camera must move: one that stands still, turns or zooms explains {100 * standing:.0f} % of what the "
             f"{len(names)} pictures have in common, so they say nothing of depth; walk around the thing"
         )
-    model, angle = _placed(pycolmap, database, images, folder / "models", [*names, *stills], seed, log)
+    model, angle = _placed(
+        pycolmap, database, images, folder / "models", [*names, *stills], seed, log, needed=set(stills)
+    )
     have = {i.name for i in model.images.values() if i.has_pose} if model else set()
     placed, lost = tuple(n for n in names if n in have), tuple(n for n in names if n not in have)
     if model is None or not _enough(len(placed), len(names)):
@@ -114,7 +116,10 @@ def solve(
         if name not in have:
             raise _unplaced(clip, f"too little of it is seen in the {len(placed)} photographs that were placed")
     if angle < FIRST_ANGLES[0]:
-        log.warn(f"no two photographs of the same points differ by {FIRST_ANGLES[0]:g} degrees; began with {angle:g}")
+        log.warn(
+            f"began with two photographs whose directions differ by {angle:g} degrees, for {FIRST_ANGLES[0]:g} placed "
+            "fewer pictures, or not all clips"
+        )
     floor, span = upright(model, camera_distance, seed, without=set(stills))
     model.write(_made(folder / "sparse" / "0"))
     error = float(model.compute_mean_reprojection_error())
@@ -262,9 +267,12 @@ def _longest_side(pycolmap, database: Path) -> float:
         opened.close()
 
 
-def _placed(pycolmap, database: Path, images: Path, folder: Path, names: list[str], seed: int, log):
-    """The largest pycolmap.Reconstruction (None: nothing) and the first angle that gave it [deg]."""
-    best, its_angle = None, FIRST_ANGLES[0]
+def _placed(
+    pycolmap, database: Path, images: Path, folder: Path, names: list[str], seed: int, log, needed: Collection[str] = ()
+):
+    """The pycolmap.Reconstruction with the most of what is `needed`, and of those the largest (None: nothing), and the
+    first angle that gave it [deg]."""
+    best, its_angle, most = None, FIRST_ANGLES[0], (0, 0)
     for angle in FIRST_ANGLES:
         options = pycolmap.IncrementalPipelineOptions()
         options.min_model_size, options.random_seed, options.mapper.init_min_tri_angle = 3, seed, angle
@@ -277,12 +285,21 @@ def _placed(pycolmap, database: Path, images: Path, folder: Path, names: list[st
             next_image_callback=lambda bar=bar: bar.update() and None,
         )
         bar.close()
-        model = max(models.values(), key=lambda m: m.num_reg_images(), default=None)
-        if model is not None and (best is None or model.num_reg_images() > best.num_reg_images()):
-            best, its_angle = model, angle
-        if best is not None and _enough(best.num_reg_images(), len(names)):
+        for model in models.values():
+            worth = _worth(model, needed)
+            if worth > most:
+                best, its_angle, most = model, angle, worth
+        if most[0] == len(needed) and _enough(most[1], len(names)):
             break
     return best, its_angle
+
+
+def _worth(model, needed: Collection[str]) -> tuple[int, int]:
+    """How many of the pictures `needed` it has placed, and how many in all."""
+    if not needed:
+        return 0, model.num_reg_images()
+    have = {image.name for image in model.images.values() if image.has_pose}
+    return len(have & set(needed)), model.num_reg_images()
 
 
 def _enough(placed: int, of: int) -> bool:

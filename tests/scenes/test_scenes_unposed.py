@@ -313,6 +313,33 @@ def test_smaller_angles_are_tried_before_giving_up(works_at, tried, tmp_path):
     assert model is None or angle == tried[-1]
 
 
+def test_a_model_that_misses_a_clip_is_not_the_last_word(tmp_path):
+    """With a stand-in for pycolmap whose larger model, from the first angle, has no place for the picture of a clip."""
+    from types import SimpleNamespace
+
+    from physics3d.scenes.sfm import _placed
+
+    def model(*names):
+        images = {i: SimpleNamespace(name=name, has_pose=True) for i, name in enumerate(names)}
+        return SimpleNamespace(images=images, num_reg_images=lambda: len(images))
+
+    made = {16: [model(*"abcdefgh")], 8: [model("a", "b"), model(*"abcdef", "clip")], 4: [], 2: []}
+
+    def incremental_mapping(database, images, folder, options, next_image_callback):
+        return dict(enumerate(made[options.mapper.init_min_tri_angle]))
+
+    def options():
+        return SimpleNamespace(mapper=SimpleNamespace())
+
+    library = SimpleNamespace(IncrementalPipelineOptions=options, incremental_mapping=incremental_mapping)
+    names = [*"abcdefgh", "clip"]
+    place = lambda **asked: _placed(
+        library, tmp_path / "a.db", tmp_path, tmp_path / "models", names, 0, Log(None), **asked
+    )
+    assert place() == (made[16][0], 16)
+    assert place(needed={"clip"}) == (made[8][1], 8)
+
+
 def test_no_more_features_are_held_than_said(tmp_path, rng, monkeypatch):
     pycolmap = pytest.importorskip("pycolmap", reason="pycolmap, the extra 'sfm', is not installed")
     from physics3d.scenes import sfm
