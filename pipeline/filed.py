@@ -7,6 +7,7 @@ and settings, and of the code as it is now.
 import os
 import shlex
 import shutil
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -49,8 +50,10 @@ def command(words: list[str]) -> str:
     return " ".join(["make run", *said, *([f"ARGS={shlex.quote(' '.join(rest))}"] if rest else [])])
 
 
-def one_line(run: Callable[[], None], error: Callable[[str], None]) -> int:
-    """Exit code of a command: 0 done, 1 it could not be, 2 the words mean nothing, 130 Ctrl-C; errors in one line."""
+def one_line(run: Callable[[], None], error: Callable[[str], None], left: str = "nothing was left") -> int:
+    """Exit code of a command: 0 done, 1 it could not be, 2 the words mean nothing, 130 Ctrl-C or SIGTERM, of which
+    `left` says what there is then; errors in one line."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         run()
     except SettingsError as wrong:
@@ -60,7 +63,7 @@ def one_line(run: Callable[[], None], error: Callable[[str], None]) -> int:
         error(f"error: {' '.join(str(wrong).split())}")
         return 1
     except KeyboardInterrupt:
-        error("\ninterrupted; nothing was left")
+        error(f"\ninterrupted; {left}")
         return 130
     return 0
 

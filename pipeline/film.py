@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from pipeline.filed import beside, megabytes, one_line
+from pipeline.places import new_place
 from pipeline.settings import SettingsError
 
 LARGEST = 8192  # side of a film that players take [px]
@@ -24,6 +25,7 @@ def film(words: list[str], environment: Mapping[str, str]) -> None:
     """Raises SettingsError, StageError, ValueError, RuntimeError or OSError with one line."""
     width, height = size_of(environment.get("SIZE") or "1280x720")
     seconds = _seconds(environment.get("LENGTH") or "")
+    out = new_place(environment, ".mp4")
 
     import torch
 
@@ -37,7 +39,7 @@ def film(words: list[str], environment: Mapping[str, str]) -> None:
     place = device(made.device)
     trajectory, fps = made.trajectory, made.trajectory.fps
     count = len(trajectory.position) if seconds is None else max(1, round(seconds * fps))
-    target = Path(environment.get("OUT") or f"exports/{made.scene}_turntable.mp4")
+    target = out or Path(f"exports/{made.scene}_turntable.mp4")
     table = Turntable(width=width, height=height, frames=count)
     log = Log(target.parent, name="film")
     print(f"writing   {count} frames of {width} x {height} px at {fps:g} per second, into {target}", flush=True)

@@ -170,10 +170,14 @@ def execute(
 
 
 def built(config: dict[str, Any], device: str) -> dict[str, Any]:
-    """Every stage, built once, so that a bad value is found before hours of work, not after. Raises StageError."""
+    """Every stage, built once, so that a bad value, or a program that is missing, is found before hours of work, not
+    after. Raises StageError."""
+    from physics3d.video import ffmpeg
+
     try:
         stages = {name: build(config.get(name), device, name) for name in STAGES}
-    except ValueError as error:
+        ffmpeg()
+    except (ValueError, RuntimeError) as error:
         raise StageError(str(error)) from error
     suit(stages, getattr(getattr(stages["capture"], "source", None), "outline", None), idle(config))
     return stages

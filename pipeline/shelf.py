@@ -55,8 +55,13 @@ def main(words: list[str]) -> int:
 def using(shelf: Path, alone: bool = False) -> Iterator[None]:
     """Hold the shelf, together with others who run, or `alone`. Raises StageError if that cannot be."""
     path = shelf / ".locks" / "shelf"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w") as handle:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        opened = path.open("w")
+    except OSError as error:
+        reason = f"results cannot be kept in {shelf} ({error.strerror}: {error.filename})"
+        raise StageError(f"{reason}; say output=<a folder that can be written>") from error
+    with opened as handle:
         try:
             fcntl.flock(handle, (fcntl.LOCK_EX if alone else fcntl.LOCK_SH) | fcntl.LOCK_NB)
         except BlockingIOError as error:

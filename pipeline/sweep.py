@@ -161,7 +161,8 @@ def swept(crew: Crew, variants: list[Variant]) -> dict[Variant, dict[str, Any]]:
     """The same; the rows of the table, of each variant its `state`, done or what went wrong, and its numbers."""
     output = Path(variants[0].config["output"]).expanduser().resolve()
     shelf, name = output / "artifacts", time.strftime("%Y%m%d-%H%M%S")
-    output.mkdir(parents=True, exist_ok=True)
+    with using(shelf):  # a place that cannot be written is said before anything is imported
+        pass
     mend(output)
     rows: dict[Variant, dict[str, Any]] = {}
     recorded: set[Path] = set()  # what one variant computed, the next one found

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from pipeline import __main__ as command
+from pipeline import sweep as sweeps
 from pipeline.__main__ import _kernels
 from pipeline.server import HERE, _go_round_proxies, server
 from pipeline.stage import StageError
@@ -73,6 +75,20 @@ def test_a_server_without_a_home_is_an_error_not_a_wait(tmp_path, environment):
     (tmp_path / "home").write_text("x")
     with pytest.raises(OSError, match="home"), server(tmp_path / "home", meanwhile=lambda: None):
         pass
+
+
+@pytest.mark.parametrize("place", ["file", "file/below", "full"])
+@pytest.mark.parametrize("sweep", [False, True])
+def test_a_place_where_no_results_can_be_kept_is_said_at_once(tmp_path, capsys, place, sweep):
+    (tmp_path / "file").write_text("x")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "artifacts").write_text("x")
+    words = ["profile=smoke", f"output={tmp_path / place}"]
+    assert sweeps.main(["scenes=ball", *words]) == 1 if sweep else command.main(["scene=ball", *words]) == 1
+    told = capsys.readouterr()
+    (line,) = told.err.splitlines()
+    assert line.startswith(f"error: results cannot be kept in {tmp_path / place / 'artifacts'} (")
+    assert line.endswith("; say output=<a folder that can be written>") and told.out == ""
 
 
 def test_kernels_are_kept_where_one_can_write(tmp_path, environment):

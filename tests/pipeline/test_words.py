@@ -66,6 +66,23 @@ def test_no_path_means_anything_to_hydra_or_omegaconf(path):
     assert OmegaConf.to_container(config, resolve=True) == {"data": f"/{path}", "file": f"/{path}/x"}
 
 
+@pytest.mark.parametrize("text", [p for p in PATHS if p not in ("null", "true", "[1,2]", "-rf.ply", "~")])
+def test_any_text_that_is_no_number_arrives_as_it_stands(text):
+    """Names of photographs and patterns of names, as browsers and telephones make them; sentences for a prior."""
+    config, _ = compose(literal_paths(["scene=thing", f"scene.prompts.0.view={text}", f"capture.clip={text}"]))
+    assert config["scene"]["prompts"][0]["view"] == config["capture"]["clip"] == text
+    config, _ = compose(
+        literal_paths(["scene=clip", "prior=wan", f"scene.source.pattern={text}", f"prior.prompt={text}"])
+    )
+    assert config["scene"]["source"]["pattern"] == config["prior"]["prompt"] == text
+
+
+@pytest.mark.parametrize("view", ["3", "-1", "1.5", "nan", "true", "[0]", "{a: 1}", "null"])
+def test_what_can_be_no_name_of_a_photograph_is_a_number_or_refused(view):
+    word = f"scene.prompts.0.view={view}"
+    assert literal_paths([word]) == [word]
+
+
 def test_which_words_are_paths():
     kept = ["learn.steps=5", "scene=bird", "~simulate.force.x", "scene.source.path=${data}/x", "world.dt=null", "data"]
     assert literal_paths(kept) == kept
