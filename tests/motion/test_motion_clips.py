@@ -12,7 +12,7 @@ from clips import FPS, decaying, encode, swaying
 from physics3d.log import Log
 from physics3d.motion.clip import read_clip
 from physics3d.motion.usable import check_clip
-from physics3d.scenes.clips import filmed_takes
+from physics3d.scenes.clips import clip_files, filmed_takes
 from physics3d.video import ffmpeg
 
 SECONDS = 2.0
@@ -223,6 +223,20 @@ def test_takes_of_a_folder_are_one_to_learn_and_others_to_predict(tmp_path, sway
         takes[0].seen_by(dataclasses.replace(camera, width=64))
     with pytest.raises(ValueError, match="no clip"):
         filmed_takes(tmp_path / "empty", log=Log(None))
+
+
+def test_clips_of_a_folder_are_files_that_fit_and_have_names_of_their_own(tmp_path):
+    for name in ("b.mp4", "a (1).mp4", "._a.mp4", "notes.txt"):
+        (tmp_path / name).touch()
+    (tmp_path / "folder.mp4").mkdir()
+    assert [p.name for p in clip_files(tmp_path)] == ["a (1).mp4", "b.mp4"]
+    assert [p.name for p in clip_files(tmp_path, "a (?).mp4")] == ["a (1).mp4"]
+    for pattern in ("/*", "c*", "[", "../*"):
+        with pytest.raises(ValueError, match="holds no clip"):
+            clip_files(tmp_path, pattern)
+    (tmp_path / "b.MOV").touch()
+    with pytest.raises(ValueError, match=r"b\.MOV and b\.mp4, whose takes would have one name"):
+        clip_files(tmp_path)
 
 
 @pytest.mark.parametrize("thing", ["carnation", "telephone"])
