@@ -200,8 +200,10 @@ def _copies(
 
     called: dict[str, str] = {}
     with_matte, with_none = [], []
+    remarks: Counter[str] = Counter()
     for path in log.progress(photographs_below(folder, log, without=without), "reading photographs"):
         picture = read_picture(path).shown()
+        remarks.update(picture.remarks)
         matte = picture.alpha
         if matte is None:
             with_none.append(path.name)
@@ -225,6 +227,8 @@ def _copies(
             f"{with_none[0]} has no alpha channel, but {with_matte[0]} has one that hides something; give all "
             "photographs a matte or none"
         )
+    for remark, count in remarks.items():
+        log.info(f"{count} of {len(called)} photographs are {remark}")
     return called
 
 
