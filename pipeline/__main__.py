@@ -41,6 +41,7 @@ Runs the pipeline on a scene; what has been computed before is reused. Keys are 
 
 
 LEAST_SPACE = 10_000_000  # what Prefect and MLflow need for their databases [byte]
+LEAST_TEMPORARY = 1_000_000  # what they need besides, for a while [byte]
 
 
 def main(words: list[str]) -> int:
@@ -89,6 +90,10 @@ def run(config: dict[str, Any], picked: dict[str, str], words: list[str], starte
         pass
     if _free(output) < LEAST_SPACE:  # the server would wait for its database, rather than end
         raise StageError(_full(output))
+    temporary = Path(tempfile.gettempdir())
+    if _free(temporary) < LEAST_TEMPORARY:
+        free = f"{_free(temporary) / 1e6:.1f} MB are free in {temporary}"
+        raise StageError(f"the disk is full ({free}); set TMPDIR=<folder>")
     _kernels(output)
     quiet()
     hits: dict[str, bool] = {}

@@ -4,6 +4,7 @@ The words are those of `make run`, so that what is found is what that command ma
 and settings, and of the code as it is now.
 """
 
+import errno
 import os
 import shlex
 import shutil
@@ -60,7 +61,8 @@ def one_line(run: Callable[[], None], error: Callable[[str], None], left: str = 
         error(f"error: {wrong}")
         return 2
     except (StageError, ValueError, RuntimeError, OSError) as wrong:
-        error(f"error: {' '.join(str(wrong).split())}")
+        full = "; free some space, or set OUT or TMPDIR to another disk" * _is_full(wrong)
+        error(f"error: {' '.join(str(wrong).split())}{full}")
         return 1
     except KeyboardInterrupt:
         error(f"\ninterrupted; {left}")
@@ -91,6 +93,10 @@ def beside(target: Path, size: int = 0, over: bool = False) -> Iterator[Path]:
         hidden.rename(target)
     finally:
         _remove(hidden)
+
+
+def _is_full(error: Exception) -> bool:
+    return isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
 
 
 def megabytes(size: int) -> str:

@@ -2,7 +2,8 @@
 
 Prefect would start one by itself, but that one dies before the flow when Ctrl-C reaches the whole terminal, and
 outlives it after `kill -9`. Ours runs in a session of its own under a shell that waits for the end of a pipe
-we hold: however this process ends, the pipe closes and the shell stops the server. Set PREFECT_API_URL to use a server
+we hold: however this process ends, the pipe closes and the shell stops the server, and a server that ends by itself
+ends the shell. Set PREFECT_API_URL to use a server
 of your own. Addresses of this machine go round any proxy.
 """
 
@@ -93,8 +94,8 @@ def _start(log: Path, host: str) -> tuple[subprocess.Popen, str]:
         port = probe.getsockname()[1]
     serve = [sys.executable, "-m", "uvicorn", "--factory", "prefect.server.api.server:create_app"]
     options = ["--host", host, "--port", str(port), "--log-level", "error", "--lifespan", "on"]
-    # "$@" is the server; cat returns when the other end of the pipe is closed
-    script = '"$@" </dev/null & server=$!; cat >/dev/null; kill $server; wait $server'
+    # "$@" is the server; cat returns when the other end of the pipe is closed. The shell ends when the server does
+    script = 'exec 3<&0; "$@" </dev/null 3<&- & server=$!; (cat <&3 >/dev/null; kill $server) & wait $server; kill $!'
     with log.open("w") as lines:
         process = subprocess.Popen(
             ["sh", "-c", script, "sh", *serve, *options],

@@ -47,9 +47,8 @@ def total_of_sums(real, sums) -> wp.Kernel:
             s = s + grids[t, i]
         m = real(s[3])
         p = vec3(real(s[0]), real(s[1]), real(s[2]))
-        if wp.static(sums != real):
-            if m > real(0.0):
-                p = m * vec3(real(s[0] / s[3]), real(s[1] / s[3]), real(s[2] / s[3]))
+        if wp.static(sums != real) and m > real(0.0):
+            p = m * vec3(real(s[0] / s[3]), real(s[1] / s[3]), real(s[2] / s[3]))
         values[i] = vec4(p[0], p[1], p[2], m)
 
     return total_of_sums_kernel

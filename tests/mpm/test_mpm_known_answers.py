@@ -36,7 +36,7 @@ def test_momenta_of_a_spinning_body_do_not_drift_in_single_precision(cells, cfl,
     """Over 1600 to 6000 substeps."""
     answer = known_answers.spinning(cells, cfl=cfl, precision="float32")
     assert answer.substeps > 1500
-    # velocities of nodes and of particles are rounded once in a substep, which walks to 4e-7 (docs/method.md, section 3);
+    # velocities of nodes and of particles are rounded once a substep, which walks to 4e-7 (docs/method.md, section 3);
     # sums in single precision walked to 2e-6, and a spin that every substep multiplies by what is rounded of dx drifted
     # by 2e-5. Places are rounded as well, which turns the body: 1.0e-6 rms of eight runs with 4000 substeps
     assert answer.more["linear"] < 1e-6

@@ -4,6 +4,7 @@ import os
 import resource
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -75,6 +76,25 @@ def test_a_server_without_a_home_is_an_error_not_a_wait(tmp_path, environment):
     (tmp_path / "home").write_text("x")
     with pytest.raises(OSError, match="home"), server(tmp_path / "home", meanwhile=lambda: None):
         pass
+
+
+def test_a_server_that_ends_by_itself_is_an_error_not_a_wait(tmp_path, environment):
+    """As where its disk is full: the database cannot be made."""
+    for name in ("PREFECT_API_URL", "PREFECT_HOME"):
+        environment.pop(name, None)
+    (tmp_path / "prefect.db").mkdir()  # no file can be made there
+    said = r"the Prefect server did not start; see .*server\.log"
+    with pytest.raises(RuntimeError, match=said), server(tmp_path, meanwhile=lambda: None):
+        pass
+    assert "Traceback" in (tmp_path / "server.log").read_text()  # it said why, and ended
+
+
+def test_a_full_temporary_folder_is_said_at_once(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", "/dev/shm")
+    monkeypatch.setattr(command, "LEAST_TEMPORARY", 1 << 60)
+    assert command.main(["scene=ball", "profile=smoke", f"output={tmp_path}"]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "MB are free in /dev/shm); set TMPDIR=<folder>" in line
 
 
 @pytest.mark.parametrize("place", ["file", "file/below", "full"])
