@@ -8,7 +8,7 @@
 MLflow is the record of runs: a result is referred to by the runs that computed or reused it, until they are deleted
 there. So one deletes runs on MLflow's page, then collects. Whoever runs holds a lock on the shelf, shared with others
 who run; collecting and cleaning need it for themselves. Only the standard library is used, so this works without .venv.
-Exit codes: 0 done, 1 it cannot be done, 2 the command line is wrong.
+Exit codes: 0 done, 1 it cannot be done, 2 the command line is wrong, 130 Ctrl-C.
 """
 
 import fcntl
@@ -48,6 +48,9 @@ def main(words: list[str]) -> int:
     except (StageError, OSError, sqlite3.Error) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:
+        print("\ninterrupted; the same command goes on from there", file=sys.stderr)
+        return 130
     return 0
 
 

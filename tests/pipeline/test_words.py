@@ -137,6 +137,10 @@ def test_make_hands_on_what_it_was_given(made, text):
     assert made("ui", f"PORT={text}")[1]["PORT"] == text
     for target in ("test", "bench-speed"):
         assert made(target, f"ARGS={text}")[1]["ARGS"] == text
+    for target in ("score", "twin", "fit-curves", "export", "film", "still", "report", "train-prior"):
+        names = ("DATA", "OUT", "REAL", "PRED", "MATERIAL", "UNSEEN", "FORMAT", "FRAME", "SIZE", "LENGTH")
+        env = made(target, *(f"{name}={text}" for name in names))[1]
+        assert {env[name] for name in names} == {text}
 
 
 @pytest.mark.parametrize("text", [t for t in PATHS if "/" not in t and "%" not in t and "=" not in t])
@@ -144,6 +148,11 @@ def test_the_name_of_a_benchmark_runs_nothing(made, text):
     target = f"bench-{text}"
     if target.strip() == target and "\t" not in target and not set(target) & set("*?[\\~"):  # make's own patterns
         assert made(target)[0][-1] == f"benchmarks/{text}.py"
+
+
+def test_files_are_utf_8_whatever_the_locale_says(made):
+    for locale in ("C", "POSIX", "de_DE.ISO-8859-1"):
+        assert made("why", LC_ALL=locale)[1]["PYTHONUTF8"] == "1"
 
 
 def split(text: str) -> subprocess.CompletedProcess:
