@@ -142,7 +142,12 @@ def execute(
     StageError with one line."""
 
     stages: dict[str, Any] = {}
-    with server(home, meanwhile=lambda: stages.update(built(config, device))):
+
+    def prepare() -> None:
+        stages.update(built(config, device))
+        first(config, shelf)  # data that is not there is said before a server is waited for
+
+    with server(home, meanwhile=prepare):
         from prefect import flow
 
         @flow(name="physics3d", flow_run_name=config["scene"]["name"], persist_result=False)
