@@ -193,7 +193,7 @@ def test_falling_bar_meets_separating_ground_at_its_plane_and_leaves_after_the_t
 @pytest.mark.parametrize("plane", [0.0, 0.3, 0.49, 0.6, 0.9])
 @pytest.mark.parametrize("rises", [False, True])
 def test_a_plate_meets_the_material_at_its_face_wherever_the_grid_lies(plane, rises):
-    """A bar that falls onto a plate at rest, and a plate that rises against a bar at rest: the same, seen from either."""
+    """A bar falls onto a plate at rest, or a plate rises against a bar at rest: seen from either, the same."""
     face, speed = plane * 0.05, 0.5
     plate = MovingCuboid(
         lower=(-1, -1, face - 0.5), upper=(1, 1, face), velocity=(0, 0, speed if rises else 0), duration=1.0
