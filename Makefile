@@ -31,6 +31,10 @@ words := SCENE PROFILE METHOD DATA ARGS PYTHON REAL PRED OUT FORMAT FRAME SIZE L
 $(foreach name,$(words),$(eval override $(name) := $$(value $(name))))
 export $(words)
 
+# files are UTF-8, whatever the locale says
+PYTHONUTF8 ?= 1
+export PYTHONUTF8
+
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .PHONY: help setup run why sweep compare pin unpin collect score twin reference-motion train-prior fit-curves export still film report ui graph view test newest bench lint \

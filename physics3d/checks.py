@@ -83,6 +83,7 @@ Rate = Annotated[float, Gt(0), Le(100_000), Unit("1/s")]
 Colour = tuple[Share, Share, Share]
 Direction = Annotated[tuple[float, float, float], NotZero()]
 Text = Annotated[str, MinLen(1)]
+Name = Annotated[str, Like(r"(?!\.{1,2}$|\s*$)[^/\\\x00-\x1f]+", "a name that a file can have")]
 Device = Annotated[str, Like(r"auto|cpu|cuda(:\d+)?", "auto, cpu, cuda or cuda:<number>")]
 Every = Literal[0] | Annotated[int, Ge(2), Le(MANY)]  # of every so many one; 0: none
 PoissonsRatio = Annotated[float, Gt(-1), Lt(0.5)]

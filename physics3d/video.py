@@ -118,7 +118,8 @@ def read_mp4(path: Path) -> tuple[UInt8[Tensor, "t h w 3"], float]:
         if not len(array):
             raise ValueError("it holds no frames")
     except (OSError, RuntimeError, ValueError, StopIteration) as error:
-        raise ValueError(f"cannot read the video {path}: {' '.join(str(error).split())[:200]}") from error
+        why = (str(error).strip().splitlines() or [type(error).__name__])[-1]  # ffmpeg says first who it is
+        raise ValueError(f"cannot read the video {path}: {' '.join(why.split())[:200]}") from error
     return torch.from_numpy(array), fps
 
 

@@ -41,6 +41,7 @@ Runs the pipeline on a scene; what has been computed before is reused. Keys are 
 
 
 LEAST_SPACE = 10_000_000  # what Prefect and MLflow need for their databases [byte]
+LEAST_TEMPORARY = 1_000_000  # what they need besides, for a while [byte]
 
 
 def main(words: list[str]) -> int:
@@ -85,9 +86,14 @@ def run(config: dict[str, Any], picked: dict[str, str], words: list[str], starte
         print(f"up to date: all {len(plan.steps)} steps were computed before ({time.monotonic() - started:.1f} s)")
         return 0
 
-    output.mkdir(parents=True, exist_ok=True)
+    with using(shelf):  # a place that cannot be written is said before anything is imported
+        pass
     if _free(output) < LEAST_SPACE:  # the server would wait for its database, rather than end
         raise StageError(_full(output))
+    temporary = Path(tempfile.gettempdir())
+    if _free(temporary) < LEAST_TEMPORARY:
+        free = f"{_free(temporary) / 1e6:.1f} MB are free in {temporary}"
+        raise StageError(f"the disk is full ({free}); set TMPDIR=<folder>")
     _kernels(output)
     quiet()
     hits: dict[str, bool] = {}
@@ -136,9 +142,13 @@ def title(picked: dict[str, str], config: dict[str, Any], words: list[str]) -> t
 
 
 def device(asked: str) -> str:
-    """auto -> cuda if there is one, else cpu. Raises SettingsError if CUDA is asked for and absent."""
-    if asked not in ("auto", "cpu") and not (asked.startswith("cuda") and here("auto") == "cuda"):
-        raise SettingsError(f"device={asked}: not available here; use device=cpu or device=auto")
+    """auto -> cuda if there is one, else cpu. Raises SettingsError for what is no device of this machine."""
+    import torch
+
+    there = ["auto", "cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+    there += [f"cuda:{i}" for i in range(torch.cuda.device_count())]
+    if asked not in there:
+        raise SettingsError(f"device={asked}: not available here; there are {', '.join(there)}")
     return here(asked)
 
 

@@ -18,6 +18,7 @@ from typing import Any
 
 from pipeline.compare_page import FIELD, FILMED, METRICS, Row, write
 from pipeline.filed import filed, one_line
+from pipeline.places import folder_to_fill
 from pipeline.settings import SettingsError, choices
 from pipeline.stage import StageError, Step, build, here, manifest
 from pipeline.sweep import OWN, Variant, asked, swept
@@ -28,7 +29,8 @@ WHOLE = "physics3d"
 
 def main(words: list[str]) -> int:
     code: list[int] = []
-    failed = one_line(lambda: code.append(compare(words)), lambda text: print(text, file=sys.stderr))
+    left = "finished stages are kept, the same command goes on from there"
+    failed = one_line(lambda: code.append(compare(words)), lambda text: print(text, file=sys.stderr), left)
     return failed or code[0]
 
 
@@ -42,6 +44,9 @@ def compare(words: list[str]) -> int:
         raise SettingsError(f"methods is {','.join(methods)}; take {WHOLE} among them, with which the others compare")
     settings = [f"runner={own.get('runner') or 'thread'}", f"workers={own.get('workers') or '1'}", *rest]
     crew, variants = asked([f"scenes={scenes}", f"methods={','.join(methods)}", *settings])
+    output = Path(variants[0].config["output"]).expanduser().resolve()
+    usual = output / "comparisons" / "-".join(dict.fromkeys(v.scene for v in variants))
+    folder = folder_to_fill({"OUT": own.get("out", "")}, usual)
     states = swept(crew, variants)
     rows: list[Row] = []
     lost: dict[tuple[str, str], str] = {}
@@ -51,8 +56,6 @@ def compare(words: list[str]) -> int:
             lost[variant.scene, variant.method] = state
             continue
         rows += of_variant(variant, rest)
-    output = Path(variants[0].config["output"]).expanduser().resolve()
-    folder = Path(own.get("out") or output / "comparisons" / "-".join(dict.fromkeys(v.scene for v in variants)))
     if not rows:
         raise StageError(f"no method ended on any scene: {next(iter(lost.values()))}")
     write(folder, rows, lost, variants[0].config)

@@ -16,6 +16,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from pipeline.filed import beside, megabytes, one_line, vacant
+from pipeline.places import new_place
 from pipeline.settings import SettingsError
 
 FORMATS = ("ply", "usd", "gltf", "spz")
@@ -34,6 +35,7 @@ def export(words: list[str], environment: Mapping[str, str]) -> None:
         raise SettingsError(f"FORMAT={kind}: take one of {', '.join(FORMATS)}; {USAGE}")
     if not frame.isdecimal():
         raise SettingsError(f"FRAME={frame} is no number of a frame; the first is 0")
+    out = new_place(environment)
 
     from physics3d.export.gltf import glb_size, write_glb
     from physics3d.export.moving import Moving
@@ -46,7 +48,7 @@ def export(words: list[str], environment: Mapping[str, str]) -> None:
     made = scene_motion(words)
     name, body, trajectory = made.scene, made.body, made.trajectory
     moving = Moving(gaussians=made.gaussians, embedding=body.embedding, trajectory=trajectory, interior=made.interior)
-    target = Path(environment.get("OUT") or f"exports/{name}_{kind}")
+    target = out or Path(f"exports/{name}_{kind}")
     vacant(target)
     size = {
         "ply": lambda: ply_size(moving),

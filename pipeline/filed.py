@@ -4,9 +4,11 @@ The words are those of `make run`, so that what is found is what that command ma
 and settings, and of the code as it is now.
 """
 
+import errno
 import os
 import shlex
 import shutil
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -49,18 +51,21 @@ def command(words: list[str]) -> str:
     return " ".join(["make run", *said, *([f"ARGS={shlex.quote(' '.join(rest))}"] if rest else [])])
 
 
-def one_line(run: Callable[[], None], error: Callable[[str], None]) -> int:
-    """Exit code of a command: 0 done, 1 it could not be, 2 the words mean nothing, 130 Ctrl-C; errors in one line."""
+def one_line(run: Callable[[], None], error: Callable[[str], None], left: str = "nothing was left") -> int:
+    """Exit code of a command: 0 done, 1 it could not be, 2 the words mean nothing, 130 Ctrl-C or SIGTERM, of which
+    `left` says what there is then; errors in one line."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         run()
     except SettingsError as wrong:
         error(f"error: {wrong}")
         return 2
     except (StageError, ValueError, RuntimeError, OSError) as wrong:
-        error(f"error: {' '.join(str(wrong).split())}")
+        full = "; free some space, or set OUT or TMPDIR to another disk" * _is_full(wrong)
+        error(f"error: {' '.join(str(wrong).split())}{full}")
         return 1
     except KeyboardInterrupt:
-        error("\ninterrupted; nothing was left")
+        error(f"\ninterrupted; {left}")
         return 130
     return 0
 
@@ -94,6 +99,10 @@ def beside(target: Path, size: int = 0, over: bool = False) -> Iterator[Path]:
         hidden.rename(target)
     finally:
         _remove(hidden)
+
+
+def _is_full(error: Exception) -> bool:
+    return isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
 
 
 def megabytes(size: int) -> str:

@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from pipeline.filed import beside, megabytes, one_line, vacant
+from pipeline.places import new_place
 from pipeline.settings import SettingsError
 
 ROUND = 6.0  # once round in less makes people dizzy [s]
@@ -27,6 +28,7 @@ def film(words: list[str], environment: Mapping[str, str]) -> None:
     """Raises SettingsError, StageError, ValueError, RuntimeError or OSError with one line."""
     width, height = size_of(environment.get("SIZE") or "1280x720")
     seconds = _seconds(environment.get("LENGTH") or "")
+    out = new_place(environment, ".mp4")
 
     import torch
 
@@ -41,7 +43,7 @@ def film(words: list[str], environment: Mapping[str, str]) -> None:
     trajectory, fps = made.trajectory, made.trajectory.fps
     once = len(trajectory.position)
     count = once * math.ceil(ROUND * fps / once) if seconds is None else max(1, round(seconds * fps))
-    target = Path(environment.get("OUT") or f"exports/{made.scene}_turntable.mp4")
+    target = out or Path(f"exports/{made.scene}_turntable.mp4")
     vacant(target)
     table = Turntable(width=width, height=height, frames=count)
     log = Log(target.parent, name="film")

@@ -3,7 +3,7 @@
 Every csv in DATA is a test (docs/laboratory.md); MATERIAL is one of conf/material and says which model, which
 parameters are fitted (learn, ties) and what the others are (start). Tests that UNSEEN names are predicted only.
 material.yaml, fit.md, tables and a picture in OUT, or in a folder beside DATA. Exit codes: 0 done, 1 the tables cannot
-be fitted, 2 DATA or MATERIAL is not given, 130 Ctrl-C.
+be fitted, 2 DATA or MATERIAL is not given or means nothing, 130 Ctrl-C.
 """
 
 import os
@@ -12,32 +12,37 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pipeline.settings import CONF, choices
+from pipeline.filed import one_line
+from pipeline.places import folder_to_fill, place
+from pipeline.settings import CONF, SettingsError, choices
 
 USAGE = "make fit-curves DATA=<folder of csv> MATERIAL=<name in conf/material> [UNSEEN=<test,test>] [OUT=<folder>]"
 
 
 def main(environment: Mapping[str, str]) -> int:
-    data, material = environment.get("DATA", ""), environment.get("MATERIAL", "")
-    if not data or not material:
-        print(f"error: {'MATERIAL' if data else 'DATA'} is not given; {USAGE}", file=sys.stderr)
-        return 2
-    folder = Path(os.path.expanduser(data))
+    return one_line(lambda: fitted(environment), lambda text: print(text, file=sys.stderr), "there is no fit.md")
+
+
+def fitted(environment: Mapping[str, str]) -> None:
+    """Raises SettingsError for what is not given, or no material, else as `fit_curves`."""
+    folder, material = place(environment, "DATA"), environment.get("MATERIAL", "")
+    if folder is None or not material:
+        raise SettingsError(f"{'DATA' if folder is None else 'MATERIAL'} is not given; {USAGE}")
+    if material not in materials():
+        raise SettingsError(f"MATERIAL is {material!r}; take one of {', '.join(materials())}")
+    whole = folder.resolve()
+    out = folder_to_fill(environment, whole.parent / f"{whole.name}_{material}")
     unseen = tuple(name.strip() for name in environment.get("UNSEEN", "").split(",") if name.strip())
-    out = Path(environment.get("OUT") or folder.with_name(f"{folder.resolve().name}_{material}"))
-    try:
-        fit_curves(folder, material, unseen, out)
-    except (ValueError, RuntimeError, OSError) as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("\ninterrupted; there is no fit.md", file=sys.stderr)
-        return 130
-    return 0
+    fit_curves(folder, material, unseen, out)
+
+
+def materials() -> list[str]:
+    """Those of conf/material that one specimen can be of."""
+    return [choice for choice in choices("material") if choice != "parts"]
 
 
 def fit_curves(folder: Path, name: str, unseen: tuple[str, ...], out: Path) -> None:
-    """Raises ValueError in one line if the material or a table cannot be used, or no test is left to fit."""
+    """Raises ValueError in one line if a table cannot be used by the material, or no test is left to fit."""
     import numpy as np
 
     from physics3d.laboratory import page
@@ -79,12 +84,7 @@ def fit_curves(folder: Path, name: str, unseen: tuple[str, ...], out: Path) -> N
 
 
 def configured(name: str) -> tuple[Any, Any, dict[str, Any]]:
-    """(material, its GlobalField, what conf/material says) of one of conf/material. Raises ValueError for another
-    name."""
-    known = [choice for choice in choices("material") if choice != "parts"]  # its parts are no one specimen
-    if name not in known:
-        raise ValueError(f"MATERIAL is {name!r}; take one of {', '.join(known)}")
-
+    """(material, its GlobalField, what conf/material says) of one of `materials`."""
     import torch
     from omegaconf import OmegaConf
 

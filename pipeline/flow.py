@@ -142,7 +142,12 @@ def execute(
     StageError with one line."""
 
     stages: dict[str, Any] = {}
-    with server(home, meanwhile=lambda: stages.update(built(config, device))):
+
+    def prepare() -> None:
+        stages.update(built(config, device))
+        first(config, shelf)  # data that is not there is said before a server is waited for
+
+    with server(home, meanwhile=prepare):
         from prefect import flow
 
         @flow(name="physics3d", flow_run_name=config["scene"]["name"], persist_result=False)
@@ -170,10 +175,14 @@ def execute(
 
 
 def built(config: dict[str, Any], device: str) -> dict[str, Any]:
-    """Every stage, built once, so that a bad value is found before hours of work, not after. Raises StageError."""
+    """Every stage, built once, so that a bad value, or a program that is missing, is found before hours of work, not
+    after. Raises StageError."""
+    from physics3d.video import ffmpeg
+
     try:
         stages = {name: build(config.get(name), device, name) for name in STAGES}
-    except ValueError as error:
+        ffmpeg()
+    except (ValueError, RuntimeError) as error:
         raise StageError(str(error)) from error
     suit(stages, getattr(getattr(stages["capture"], "source", None), "outline", None), idle(config))
     return stages

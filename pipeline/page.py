@@ -12,7 +12,7 @@ from contextlib import suppress
 from functools import partial
 from typing import Annotated, Any
 
-from physics3d.checks import Count, Device, Frames, Like, Pixels, Seed, Text, complaint
+from physics3d.checks import Count, Device, Frames, Like, Name, Pixels, Seed, Text, complaint
 from pipeline.fields import Class, Declared, Unknown, classes, declared
 
 STAGES = ("capture", "guess", "reconstruct", "segment", "fill", "learn", "simulate", "render", "foretell", "evaluate")
@@ -26,7 +26,7 @@ PLAIN = {  # entries that belong to no class
     "seed": Seed,
     "verify": bool,
     "twin": {"views": Count, "width": Pixels, "height": Pixels, "frames": Frames},
-    "scene": {"name": Text},
+    "scene": {"name": Name},
     "use": {name: Key | None for name in STEPS},
 }
 USED_BY_STAGES = {  # entries that stages take over; those of a class are checked there
@@ -75,6 +75,8 @@ def _problems(config: dict[str, Any]) -> Iterator[str]:
             yield from filter(None, [_object(_any_stage, config[name], name)])
         elif name not in MAY_BE_NULL:
             yield f"{name} is null; only {', '.join(MAY_BE_NULL)} may be, keep the others"
+        elif name not in config:
+            yield f"{name} is missing; {name}=null leaves it out"
     yield from _between(config)
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from pipeline.filed import megabytes, one_line
 from pipeline.settings import SettingsError, compose
 from pipeline.stage import build
+from pipeline.words import literal_paths
 
 EDGE, STEPS = 0.010, 6
 
@@ -29,8 +30,11 @@ def write(words: list[str]) -> None:
     try:
         edge, steps = float(own.get("edge", EDGE)), int(own.get("steps", STEPS))
     except ValueError:
-        raise SettingsError(f"{own}: edge is a length in m, steps a whole number") from None
-    settings, _ = compose([w for w in words if not w.startswith(("edge=", "steps="))])
+        edge, steps = 0.0, 0
+    if not (1e-4 <= edge <= 1 and 1 <= steps <= 1000):
+        said = " ".join(f"{name}={value}" for name, value in own.items())
+        raise SettingsError(f"{said}: take an edge of 1e-4 to 1 m, and a whole number of 1 to 1000 steps")
+    settings, _ = compose(literal_paths([w for w in words if not w.startswith(("edge=", "steps="))]))
     from physics3d.log import Log
     from physics3d.scenes import finite_elements, reference_motion
     from physics3d.scenes.carnation import CarnationTwin

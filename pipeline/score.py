@@ -10,25 +10,23 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
+from pipeline.filed import one_line
+from pipeline.places import folder_to_fill, place
+from pipeline.settings import SettingsError
+
 USAGE = "make score REAL=<clip> PRED=<clip> [OUT=<folder>]: any two videos of one motion, from the same camera"
 
 
 def main(environment: Mapping[str, str]) -> int:
-    real, predicted = environment.get("REAL", ""), environment.get("PRED", "")
-    if not real or not predicted:
-        print(f"error: {'PRED' if real else 'REAL'} is not given; {USAGE}", file=sys.stderr)
-        return 2
-    target = Path(predicted)
-    folder = Path(environment.get("OUT") or target.with_name(f"{target.stem}_score"))
-    try:
-        score(Path(real), target, folder)
-    except (ValueError, RuntimeError, OSError) as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("\ninterrupted; there is no score.md", file=sys.stderr)
-        return 130
-    return 0
+    return one_line(lambda: scored(environment), lambda text: print(text, file=sys.stderr), "there is no score.md")
+
+
+def scored(environment: Mapping[str, str]) -> None:
+    """Raises SettingsError for what is not given, else as `score`."""
+    real, predicted = place(environment, "REAL"), place(environment, "PRED")
+    if real is None or predicted is None:
+        raise SettingsError(f"{'REAL' if real is None else 'PRED'} is not given; {USAGE}")
+    score(real, predicted, folder_to_fill(environment, predicted.absolute().parent / f"{predicted.stem}_score"))
 
 
 def score(real: Path, predicted: Path, folder: Path) -> None:

@@ -59,11 +59,19 @@ def before_checks(words: list[str]) -> tuple[dict[str, Any], dict[str, Any], dic
             written = cast(dict[str, Any], OmegaConf.to_container(config, resolve=False))
             return cast(dict[str, Any], OmegaConf.to_container(config, resolve=True)), written, picked
         except (HydraException, OmegaConfBaseException) as error:
-            gone = re.search(r"(?:Interpolation key '|Error trying to access )([\w.]+)", str(error))
-            line = str(error).strip().splitlines()[0]
-            raise SettingsError(
-                f"{gone[1]} is not there, but others are taken from it; keep it" if gone else line
-            ) from error
+            raise SettingsError(_told(str(error))) from error
+
+
+def _told(error: str) -> str:
+    """One line of what Hydra says, with the remedy where it has none."""
+    if gone := re.search(r"(?:Interpolation key '|Error trying to access )([\w.]+)", error):
+        return f"{gone[1]} is not there, but others are taken from it; keep it"
+    if odd := re.search(r"(?:Error merging override |Could not override ')([\w.]+)", error):
+        key = odd[1]
+        return (
+            f"{key} cannot become that; set what is in it by {key}.<name>=<value>, what is new by +{key}.<name>=<value>"
+        )
+    return error.strip().splitlines()[0]
 
 
 @cache  # runs of a sweep differ in seeds and numbers more often than in groups
@@ -90,6 +98,8 @@ def _of_the_material(config: Any, picked: dict[str, str], words: list[str]) -> N
     a branch, say, under METHOD=without_viscoelastic. What is on the command line stays, and is refused."""
     from omegaconf import OmegaConf
 
+    if not OmegaConf.is_dict(OmegaConf.select(config, "material.start")):
+        return  # and is refused
     starts = lambda kind: set(OmegaConf.load(CONF / "material" / f"{kind}.yaml").start)
     others = set(config.material.start) - starts(picked["material"])
     said = {word.partition("=")[0] for word in words}
@@ -107,7 +117,10 @@ def _by_the_handbook(config: Any, picked: dict[str, str]) -> None:
     if OmegaConf.select(config, "scene.thing") is None:
         return
     usual = OmegaConf.load(CONF / "material" / f"{picked['material']}.yaml")
-    nodes = {key: OmegaConf.to_container(config[key], resolve=False) for key in ("scene", "learn") if config[key]}
+    if not OmegaConf.is_dict(OmegaConf.select(config, "material.start")):
+        return  # and is refused
+    there = [key for key in ("scene", "learn") if OmegaConf.is_dict(config.get(key))]
+    nodes = {key: OmegaConf.to_container(config[key], resolve=False) for key in there}
     plain: dict[str, Any] = {"learn": None, **nodes, "material": {"start": dict(config.material.start)}}
     try:
         fill_in(plain, dict(usual.start), read(CONF / "handbook.yaml"))
@@ -124,6 +137,8 @@ def _check_word(word: str) -> None:
     key, equals, value = word.partition("=")
     if not equals and not key.startswith("~"):
         raise SettingsError(f"{word!r} is not of the form key=value, e.g. scene=carnation or learn.steps=50")
+    if key.lstrip("+~").partition(".")[0] == "hydra":
+        raise SettingsError(f"{word!r}: settings of Hydra change nothing here; leave it out")
     if key in GROUPS and value not in choices(key):
         raise SettingsError(f"no {key} {value!r}; there are {', '.join(choices(key))}")
 
@@ -138,10 +153,12 @@ def _known_or_new(word: str, known: dict[str, Any]) -> str:
     from hydra.errors import HydraException
 
     try:
-        OverridesParser.create().parse_override(word)
+        read = OverridesParser.create().parse_override(word)
     except HydraException as error:
         raise SettingsError(f"cannot read {word!r}: {str(error).splitlines()[0]}") from error
     key, _, value = word.partition("=")
+    if read.is_sweep_override():
+        raise SettingsError(f"{word}: one value is needed; a list is {key}=[...], many runs are made by make sweep")
     if key.startswith("+"):
         return word
     node: Any = known

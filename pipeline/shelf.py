@@ -8,7 +8,7 @@
 MLflow is the record of runs: a result is referred to by the runs that computed or reused it, until they are deleted
 there. So one deletes runs on MLflow's page, then collects. Whoever runs holds a lock on the shelf, shared with others
 who run; collecting and cleaning need it for themselves. Only the standard library is used, so this works without .venv.
-Exit codes: 0 done, 1 it cannot be done, 2 the command line is wrong.
+Exit codes: 0 done, 1 it cannot be done, 2 the command line is wrong, 130 Ctrl-C.
 """
 
 import fcntl
@@ -48,6 +48,9 @@ def main(words: list[str]) -> int:
     except (StageError, OSError, sqlite3.Error) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:
+        print("\ninterrupted; the same command goes on from there", file=sys.stderr)
+        return 130
     return 0
 
 
@@ -55,8 +58,13 @@ def main(words: list[str]) -> int:
 def using(shelf: Path, alone: bool = False) -> Iterator[None]:
     """Hold the shelf, together with others who run, or `alone`. Raises StageError if that cannot be."""
     path = shelf / ".locks" / "shelf"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w") as handle:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        opened = path.open("w")
+    except OSError as error:
+        reason = f"results cannot be kept in {shelf} ({error.strerror}: {error.filename})"
+        raise StageError(f"{reason}; say output=<a folder that can be written>") from error
+    with opened as handle:
         try:
             fcntl.flock(handle, (fcntl.LOCK_EX if alone else fcntl.LOCK_SH) | fcntl.LOCK_NB)
         except BlockingIOError as error:

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from pipeline.filed import beside, filed, one_line
 from pipeline.film import size_of
+from pipeline.places import new_place
 
 
 def main(words: list[str], environment: Mapping[str, str]) -> int:
@@ -25,6 +26,7 @@ def main(words: list[str], environment: Mapping[str, str]) -> int:
 def still(words: list[str], environment: Mapping[str, str]) -> None:
     """Raises SettingsError, StageError, ValueError or OSError with one line."""
     width, height = size_of(environment.get("SIZE") or "1024x576")
+    out = new_place(environment, ".png")
     config, _, steps = filed(words, "capture", "reconstruct")
 
     import torch
@@ -39,7 +41,7 @@ def still(words: list[str], environment: Mapping[str, str]) -> None:
     camera = capture.seen_from(config["render"]["view"], key="render.view").framed(width, height)
     with torch.no_grad():
         picture = to_uint8(render(gaussians, camera, background=capture.background).color)
-    target = Path(environment.get("OUT") or f"exports/{capture.name}_still.png")
+    target = out or Path(f"exports/{capture.name}_still.png")
     with beside(target) as hidden:
         Image.fromarray(picture.numpy()).save(hidden, format="PNG")
     print(f"written   {target}   {width} x {height} px; make a clip of it, then ARGS=capture.clip=<its file>")

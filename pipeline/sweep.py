@@ -112,7 +112,7 @@ def main(words: list[str]) -> int:
     except SettingsError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    except (StageError, OSError, RuntimeError) as error:
+    except (StageError, OSError, RuntimeError, ValueError) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
@@ -146,10 +146,21 @@ def _crew(own: dict[str, str], most: int) -> Crew:
         raise SettingsError(f"runner={runner} needs the package {package}; pip install {package}, or runner=process")
     if where and runner not in ("dask", "ray"):
         raise SettingsError(f"address={where}: runner={runner} stays on this machine; take runner=dask, or no address")
+    if where and not _is_address(where, runner):
+        raise SettingsError(f"address={where} is none of a cluster; take address=tcp://<host>:<port>")
     workers = own.get("workers") or str(min(most, os.cpu_count() or 1))
     if not re.fullmatch("[1-9][0-9]{0,3}", workers):
         raise SettingsError(f"workers is {workers!r}; take a number from 1 to 9999")
     return Crew(runner=runner, workers=int(workers), address=where)
+
+
+def _is_address(text: str, runner: str) -> bool:
+    """Whether a cluster can be asked for there; Ray also knows names without a port."""
+    try:
+        parts = urlsplit(text)
+        return runner == "ray" or bool(parts.scheme and parts.hostname and parts.port)
+    except ValueError:
+        return False
 
 
 def run(crew: Crew, variants: list[Variant]) -> int:
@@ -161,7 +172,8 @@ def swept(crew: Crew, variants: list[Variant]) -> dict[Variant, dict[str, Any]]:
     """The same; the rows of the table, of each variant its `state`, done or what went wrong, and its numbers."""
     output = Path(variants[0].config["output"]).expanduser().resolve()
     shelf, name = output / "artifacts", time.strftime("%Y%m%d-%H%M%S")
-    output.mkdir(parents=True, exist_ok=True)
+    with using(shelf):  # a place that cannot be written is said before anything is imported
+        pass
     mend(output)
     rows: dict[Variant, dict[str, Any]] = {}
     recorded: set[Path] = set()  # what one variant computed, the next one found

@@ -15,6 +15,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from pipeline.__main__ import device
+from pipeline.filed import one_line
+from pipeline.places import folder_to_fill
+from pipeline.settings import SettingsError
+
 USAGE = 'make train-prior [OUT=<folder>] [ARGS="steps=2000 seed=0 device=cpu forms=40 films=40"]'
 DEFAULTS: dict[str, Any] = {
     "steps": 2000,
@@ -28,34 +33,29 @@ LEVELS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 60.0)  # sigma/alpha at which the resu
 
 
 def main(words: list[str], environment: Mapping[str, str]) -> int:
-    try:
-        options = asked(words)
-    except ValueError as error:
-        print(f"error: {error}; {USAGE}", file=sys.stderr)
-        return 2
-    out = Path(os.path.expanduser(environment.get("OUT") or "outputs/tiny_video"))
-    try:
-        train_prior(out, **options)
-    except (ValueError, RuntimeError, OSError) as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("\ninterrupted; the same command goes on from here", file=sys.stderr)
-        return 130
+    left = "the same command goes on from here"
+    return one_line(lambda: trained(words, environment), lambda text: print(text, file=sys.stderr), left)
+
+
+def trained(words: list[str], environment: Mapping[str, str]) -> None:
+    """Raises SettingsError for words that mean nothing or a device that is not there, else as `train_prior`."""
+    options = asked(words)
+    device(options["device"])
+    out = folder_to_fill(environment, "outputs/tiny_video")
+    train_prior(out, **options)
     print(f"written   {out}   use it by prior=tiny_video prior.weights={out}")
-    return 0
 
 
 def asked(words: list[str]) -> dict[str, Any]:
-    """The options by name. Raises ValueError for a word that is none of them."""
+    """The options by name. Raises SettingsError for a word that is none of them."""
     options = dict(DEFAULTS)
     for word in words:
         name, equals, text = word.partition("=")
         if name not in options or not equals:
-            raise ValueError(f"no option {word!r}")
+            raise SettingsError(f"no option {word!r}; {USAGE}")
         if isinstance(DEFAULTS[name], int):
             if not text.isdecimal() or (name != "seed" and int(text) == 0):
-                raise ValueError(f"{word}: take a whole number")
+                raise SettingsError(f"{word}: take a whole number; {USAGE}")
             options[name] = int(text)
         else:
             options[name] = text

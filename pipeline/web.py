@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from pipeline.filed import beside, megabytes, one_line
+from pipeline.places import new_place
 
 
 def main(words: list[str], environment: Mapping[str, str]) -> int:
@@ -23,12 +24,12 @@ def write(words: list[str], environment: Mapping[str, str]) -> None:
     from pipeline.scene_page import scene_page
     from pipeline.shelf_page import shelf_page
 
+    out = new_place(environment, ".html")
     one = any(word.startswith("scene=") for word in words)
     name, text = scene_page(words) if one else shelf_page(words)
-    chosen = environment.get("OUT", "")
-    target = Path(chosen or f"exports/{name}.html")
+    target = out or Path(f"exports/{name}.html")
     page = text.encode()
-    with beside(target, len(page), over=not chosen) as hidden:
+    with beside(target, len(page), over=out is None) as hidden:
         hidden.write_bytes(page)
     print(f"written   {target}   {megabytes(len(page))}; open it in a browser")
 

@@ -14,11 +14,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from pipeline.filed import one_line
 from pipeline.flow import Plan, first, plan
-from pipeline.settings import SettingsError, compose
+from pipeline.settings import compose
 from pipeline.stage import (
     MANIFEST,
-    StageError,
     Step,
     Unknown,
     damage,
@@ -36,17 +36,14 @@ KINDS = ("config", "code", "data", "libraries")
 
 
 def main(words: list[str]) -> int:
-    try:
-        config, _ = compose(literal_paths(words))
-        for line in explain(config, Path(config["output"]).expanduser().resolve() / "artifacts"):
-            print(line)
-        return 0
-    except SettingsError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except StageError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
+    return one_line(lambda: say(words), lambda text: print(text, file=sys.stderr), "nothing was changed")
+
+
+def say(words: list[str]) -> None:
+    """Raises SettingsError for words that mean nothing, StageError as a run would."""
+    config, _ = compose(literal_paths(words))
+    for line in explain(config, Path(config["output"]).expanduser().resolve() / "artifacts"):
+        print(line)
 
 
 def explain(config: dict[str, Any], shelf: Path) -> Iterator[str]:

@@ -63,7 +63,8 @@ def read_folder(folder: Path) -> list[LabTest]:
     """Every *.csv of the folder, by name. Raises ValueError in one line naming file, row and remedy."""
     if not folder.is_dir():
         raise ValueError(f"no folder at {folder}; give DATA=<folder with a csv for each test>")
-    paths = sorted(p for p in folder.iterdir() if p.suffix.lower() == ".csv")
+    # systems and spreadsheets leave hidden files beside those that they opened
+    paths = sorted(p for p in folder.iterdir() if p.suffix.lower() == ".csv" and p.is_file() and p.name[0] not in ".~")
     if not paths:
         raise ValueError(f"{folder} holds no .csv; put a table for each test into it (docs/laboratory.md)")
     return [read_table(path) for path in paths]
@@ -79,8 +80,11 @@ def read_table(path: Path) -> LabTest:
     rows = [(i + 1, line) for i, line in enumerate(lines) if line.strip() and not line.startswith("#")]
     if not rows:
         raise ValueError(f"{path.name} is empty; its first line names the columns")
-    columns = _columns(path.name, next(csv.reader([rows[0][1]])))
-    table = np.array([_numbers(path.name, i, line, columns) for i, line in rows[1:]])
+    try:
+        columns = _columns(path.name, next(csv.reader([rows[0][1]])))
+        table = np.array([_numbers(path.name, i, line, columns) for i, line in rows[1:]])
+    except csv.Error as error:
+        raise ValueError(f"{path.name} is no csv ({error}); save it as one again") from error
     if len(table) < 2:
         raise ValueError(f"{path.name} has {len(table)} rows of numbers; it needs 2 or more")
     found = {name: table[:, i] * UNITS[name][unit] for i, (name, unit) in enumerate(columns)}
@@ -132,7 +136,7 @@ def _numbers(name: str, row: int, line: str, columns: list[tuple[str, str]]) -> 
     numbers = []
     for cell, (quantity, _) in zip(cells, columns):
         try:
-            numbers.append(float(cell))
+            numbers.append(float(cell.replace("_", "?")))  # which Python would take as a part of a number
         except ValueError as error:
             raise ValueError(f"{name}, line {row}: {quantity} is {cell.strip()!r}, no number; mend the row") from error
         if not math.isfinite(numbers[-1]):

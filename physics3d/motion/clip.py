@@ -44,16 +44,17 @@ def read_clip(
 ) -> Clip:
     """Frames between `start` and `stop` [s], no side longer than `longest_side` px, at `fps` (None: as filmed).
 
-    Raises ValueError in one line: no such file, unreadable, no video in it, fewer than two frames, rate unknown, too
-    large to hold; RuntimeError if there is no ffmpeg.
+    Raises ValueError in one line: no such file, unreadable, damaged, no video in it, fewer than two frames, rate
+    unknown, too large to hold; RuntimeError if there is no ffmpeg.
     """
     program = ffmpeg()
     if not path.is_file():
         raise ValueError(f"no clip at {path}; check the path")
     if fps is not None and not 0 < fps < 1000:
         raise ValueError(f"fps is {fps:g}; give frames per second above 0, or leave it out")
+    path = path.absolute()  # no name is then an option or a protocol of ffmpeg
     header, times = _header(program, path), _times(program, path)
-    notes = []
+    notes = _cut_short(header, times)
     container = re.search(r"Input #0, ([^,]+)", header)
     if container is not None and container[1] in BARE:
         times = times[:0]
@@ -99,6 +100,18 @@ def _header(program: str, path: Path) -> str:
     return told
 
 
+def _cut_short(header: str, times: np.ndarray) -> list[str]:
+    """A note where the file says that it lasts longer than its frames do: some containers are read up to their cut."""
+    said = re.search(r"Duration: (\d+):(\d+):(\d+(?:\.\d+)?)", header)
+    if said is None or len(times) < 2:
+        return []
+    hours, minutes, seconds = (float(part) for part in said.groups())
+    whole, there = 3600 * hours + 60 * minutes + seconds, (times[-1] - times[0]) * len(times) / (len(times) - 1)
+    if there > 0.8 * whole:
+        return []
+    return [f"{there:.2f} s of frames, where the file says that it lasts {whole:.2f} s: it may be cut short"]
+
+
 def _times(program: str, path: Path) -> np.ndarray:
     """Times of the frames in order [s], from the packets: nothing is decoded."""
     command = ["-v", "error", "-nostdin", "-i", str(path), "-map", "0:v:0", "-c", "copy", "-f", "framecrc", "-"]
@@ -116,7 +129,7 @@ def _run(command: list[str]) -> subprocess.CompletedProcess[str]:
 
 def _decoded(program: str, source: list[str], filters: list[str], path: Path) -> Tensor:
     """Frames as ffmpeg hands them on: PPM pictures, each of which knows its size."""
-    command = [program, "-v", "error", "-nostdin", *source, "-map", "0:v:0"]
+    command = [program, "-v", "error", "-xerror", "-nostdin", *source, "-map", "0:v:0"]
     command += ["-vf", ",".join(filters)] if filters else []
     command += ["-f", "image2pipe", "-c:v", "ppm", "-pix_fmt", "rgb24", "-"]
     frames, total = [], 0
@@ -134,6 +147,11 @@ def _decoded(program: str, source: list[str], filters: list[str], path: Path) ->
                 frames.append(np.frombuffer(data, np.uint8).reshape(h, w, 3))
         said.seek(0)
         lines = said.read().decode(errors="replace").strip().splitlines()
+    if frames and process.returncode:
+        why = re.sub(r"\[\S+ @ \w+\] ", "", lines[0]) if lines else f"ffmpeg ended with status {process.returncode}"
+        raise ValueError(
+            f"{path.name} is damaged after {len(frames)} frames ({why}); copy it again, or cut a whole piece out of it"
+        )
     if not frames:
         why = lines[-1] if lines else "no frame in it"
         raise ValueError(f"cannot read the clip {path.name}: {why}; give a file that a player shows")

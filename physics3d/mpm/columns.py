@@ -1,8 +1,8 @@
 """Sums over the 27 nodes around a particle: the inner loops of the transfers, each in two forms.
 
     gathered(v, ...)        rows sum w v, sum w v r_x, sum w v r_y, sum w v r_z                 r = x_i - x_p [cells]
-    spread(grid, ...)       node += w (q + A r, m)                                      q = m v
-    spread_vectors(grid, ...)  node += w (q + A r)
+    spread(grid, ...)       node += w (m v + A r, m)
+    spread_vectors(grid, ...)  node += w (q + A r)                                      q = m v
     spread_adjoint(G, ...)  with (P, M) of a node: rows of `gathered` for (P, M), then sum grad w [P . (q + A r) + m M]
     gathered_adjoint(v, ...)  node += w (V + B r);  rows sum w v, sum grad w [v . (V + B r)]
 
@@ -104,7 +104,7 @@ def gathered(real, fast: bool) -> wp.Function:
 
 @cache
 def spread(real, fast: bool, sums) -> wp.Function:
-    """spread(grid: array[vec4 of `sums`], first node, ny, nz, f, w, q, m, A); `sums` of the fast form are double."""
+    """spread(grid: array[vec4 of `sums`], first node, ny, nz, f, w, v, m, A); `sums` of the fast form are double."""
     vec3, vec4, mat33 = _vector(real, 3), _vector(sums, 4), wp.types.matrix((3, 3), real)
 
     if fast:
@@ -114,7 +114,7 @@ def spread(real, fast: bool, sums) -> wp.Function:
             + _columns_of_A
             + """
             V* first = (V*)grid.data + node;
-            V qi = V{q[0], q[1], q[2], m} - T(f[0]) * ax - T(f[1]) * ay - T(f[2]) * az;
+            V qi = T(m) * V{v[0], v[1], v[2], 1} - T(f[0]) * ax - T(f[1]) * ay - T(f[2]) * az;
             #pragma unroll
             for (int i = 0; i < 3; ++i) {
                 V qj = qi;
@@ -133,17 +133,17 @@ def spread(real, fast: bool, sums) -> wp.Function:
             """
         )
         def native(
-            grid: wp.array(dtype=vec4), node: int, ny: int, nz: int, f: vec3, w: mat33, q: vec3, m: real, A: mat33
+            grid: wp.array(dtype=vec4), node: int, ny: int, nz: int, f: vec3, w: mat33, v: vec3, m: real, A: mat33
         ): ...
 
         return native
 
     @wp.func
-    def plain(grid: wp.array(dtype=vec4), node: int, ny: int, nz: int, f: vec3, w: mat33, q: vec3, m: real, A: mat33):
+    def plain(grid: wp.array(dtype=vec4), node: int, ny: int, nz: int, f: vec3, w: mat33, v: vec3, m: real, A: mat33):
         ax = vec3(A[0, 0], A[1, 0], A[2, 0])
         ay = vec3(A[0, 1], A[1, 1], A[2, 1])
         az = vec3(A[0, 2], A[1, 2], A[2, 2])
-        qi = q - A * f  # of the lowest node; built up by its increments from node to node
+        qi = m * v - A * f  # of the lowest node; built up by its increments from node to node
         for i in range(3):
             qij = qi
             for j in range(3):

@@ -121,7 +121,7 @@ def particle_pass(
                             )
                     m = left * whole_mass[p]
                     A = (real(4.0) * m) * (L / rate) - (rate * kick * left * whole_volume[p]) * stress
-                    spread(grid, node, ny, nz, f, weights(f), m * v, m, A)
+                    spread(grid, node, ny, nz, f, weights(f), v, m, A)
                 else:
                     wp.atomic_add(lost, 0, 1)
         else:

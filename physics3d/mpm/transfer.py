@@ -63,7 +63,7 @@ def scatter(real, sums, fast: bool = False) -> wp.Kernel:
             rate = real(4.0) / dx
             # not (m dx) L: what rounding makes of dx would slow or speed up the spin of every particle alike
             A = (real(4.0) * m) * (L[p] / rate) - (rate * kick * volume[p]) * tau[p]
-            spread(grid, node, ny, nz, f, weights(f), m * v[p], m, A)
+            spread(grid, node, ny, nz, f, weights(f), v[p], m, A)
         else:
             wp.atomic_add(lost, 0, 1)
 

@@ -18,7 +18,7 @@ import torch
 from annotated_types import Ge, Gt, Lt
 from jaxtyping import Bool, Float
 
-from physics3d.checks import LeftTopRightBottom, Length, Pixels, Positive, Share, Text, require_fields
+from physics3d.checks import LeftTopRightBottom, Length, Name, Pixels, Positive, Share, Text, require_fields
 from physics3d.gaussians.cameras import Camera, look_at
 from physics3d.motion.thing import moving_thing
 from physics3d.scenes.base import AbstractSource, Capture, Take
@@ -31,7 +31,7 @@ GRIP = 5.0  # around such pixels, at least [px]
 
 @dataclass(frozen=True, kw_only=True)
 class ClipSource(AbstractSource):
-    name: Text
+    name: Name
     path: Text  # a clip, or a folder of clips
     camera_distance: Length  # from the thing [m]; sets the size of everything
     box: Annotated[tuple[Share, Share, Share, Share], LeftTopRightBottom()] = (0.02, 0.02, 0.98, 0.98)

@@ -7,6 +7,7 @@ release the motion is free, and learning finds the state it starts from.
 """
 
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 import numpy as np
@@ -84,9 +85,13 @@ def require_same_view(take: FilmedTake, photograph: UInt8[Tensor, "H W 3"], *, c
 def clip_files(path: Path, pattern: str = "*") -> list[Path]:
     """The clip itself, or the clips of a folder whose names fit, in their order. Raises ValueError if there is none."""
     if path.is_dir():
-        found = sorted(p for p in path.glob(pattern) if p.suffix.lower() in VIDEOS and not p.name.startswith("."))
+        clips = (p for p in path.iterdir() if p.suffix.lower() in VIDEOS and p.is_file() and p.name[0] != ".")
+        found = sorted(p for p in clips if fnmatchcase(p.name, pattern))
         if not found:
             raise ValueError(f"{path} holds no clip {pattern} ({', '.join(VIDEOS)}); put one there")
+        alike = [p.name for p in found if [q.stem for q in found].count(p.stem) > 1]
+        if alike:
+            raise ValueError(f"{path} holds {' and '.join(alike)}, whose takes would have one name; rename all but one")
         return found
     if not path.is_file():
         raise ValueError(f"no clip at {path}; check the path")

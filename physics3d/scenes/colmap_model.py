@@ -5,6 +5,7 @@ A point is seen at X_c = R(q) X + t, q = (w, x, y, z). rigs and frames of COLMAP
 
 import os
 import struct
+from collections.abc import Container
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -79,11 +80,13 @@ def read_model(root: Path) -> ColmapModel:
 def _read_text(files: tuple[Path, ...]) -> ColmapModel:
     model = ColmapModel(files)
     file, number = files[0], 0
+    ids: set[int] = set()
     try:
         for number, line in _lines(file):  # noqa: B007 the error below names the line
             w = line.split()
             if w[1] in PERSPECTIVE and len(w) != 4 + len(PERSPECTIVE[w[1]]):
                 raise ValueError(f"{w[1]} has {len(PERSPECTIVE[w[1]])} parameters, here are {len(w) - 4}")
+            _require_new("camera", int(w[0]), model.cameras)
             model.cameras[int(w[0])] = ColmapCamera(w[1], int(w[2]), int(w[3]), tuple(map(float, w[4:])))
         file, number = files[1], 0
         lines = iter(_lines(file, blank=True))
@@ -92,6 +95,8 @@ def _read_text(files: tuple[Path, ...]) -> ColmapModel:
                 continue
             w = line.split(maxsplit=9)
             pose = tuple(map(float, w[1:8]))
+            _require_new("image", int(w[0]), ids)
+            ids.add(int(w[0]))
             model.images.append(ColmapImage(int(w[0]), w[9].strip(), int(w[8]), pose[:4], pose[4:]))
             number, second = next(lines, (number, ""))  # may be empty
             if not _is_key_points(second):
@@ -124,6 +129,20 @@ def _lines(file: Path, *, blank: bool = False) -> list[tuple[int, str]]:
     return [(n, line) for n, line in numbered if not line.startswith("#") and (blank or line.strip())]
 
 
+def _require_new(what: str, number: int, known: Container[int]) -> None:
+    """Points say by these numbers where they are seen, and images by which camera they were taken."""
+    if number in known:
+        raise ValueError(f"{what} {number} is there twice, and each needs a number of its own")
+
+
+def _require_end(data: bytes, at: int) -> None:
+    """What a number of entries announces is all that a binary file holds."""
+    if at > len(data):
+        raise ValueError("it ends within its last entry")
+    if at < len(data):
+        raise ValueError(f"{len(data) - at} bytes are left after its last entry")
+
+
 def _is_key_points(line: str) -> bool:
     words = line.split()
     try:
@@ -135,6 +154,7 @@ def _is_key_points(line: str) -> bool:
 def _read_binary(files: tuple[Path, ...]) -> ColmapModel:
     model = ColmapModel(files)
     file = files[0]
+    ids: set[int] = set()
     try:
         data, at = file.read_bytes(), 8
         for _ in range(struct.unpack_from("<Q", data)[0]):
@@ -143,8 +163,10 @@ def _read_binary(files: tuple[Path, ...]) -> ColmapModel:
                 raise ValueError(f"camera {camera} has model number {kind}, known are 0 to {max(MODELS)}")
             name, count = MODELS[kind]
             parameters = struct.unpack_from(f"<{count}d", data, at + 24)
+            _require_new("camera", camera, model.cameras)
             model.cameras[camera] = ColmapCamera(name, width, height, parameters)
             at += 24 + 8 * count
+        _require_end(data, at)
         file = files[1]
         data, at = file.read_bytes(), 8
         for _ in range(struct.unpack_from("<Q", data)[0]):
@@ -153,9 +175,10 @@ def _read_binary(files: tuple[Path, ...]) -> ColmapModel:
             name = os.fsdecode(data[at + 64 : end])
             (observations,) = struct.unpack_from("<Q", data, end + 1)
             at = end + 9 + 24 * observations
+            _require_new("image", number, ids)
+            ids.add(number)
             model.images.append(ColmapImage(number, name, camera, tuple(pose[:4]), tuple(pose[4:])))
-        if at > len(data):
-            raise ValueError("key points are missing at the end")
+        _require_end(data, at)
         file = files[2]
         data, at = file.read_bytes(), 8
         xyz, rgb = [], []
@@ -169,8 +192,9 @@ def _read_binary(files: tuple[Path, ...]) -> ColmapModel:
             index += [i] * length
             seen += track[::2]
             at += 51 + 8 * length
+        _require_end(data, at)
     except (struct.error, ValueError, OverflowError) as error:
-        raise ValueError(f"cannot read {file}: {error}; the file is cut short or not COLMAP's binary format") from error
+        raise ValueError(f"cannot read {file}: {error}; the file is damaged or not COLMAP's binary format") from error
     _set_points(model, xyz, rgb, index, seen)
     return model
 

@@ -19,7 +19,7 @@ def sharpest_frames(video: Path, target: Path, count: int, longest_side: int, lo
 
     if not video.is_file():
         raise ValueError(f"no video at {video}; give it: make run SCENE=photos DATA=<folder or video>")
-    reader = cv2.VideoCapture(str(video))
+    reader = cv2.VideoCapture(str(video.absolute()))  # no name is then a protocol
     total = int(reader.get(cv2.CAP_PROP_FRAME_COUNT))
     if total <= 0 and reader.isOpened():
         total = _counted(video)
@@ -50,7 +50,7 @@ def _counted(video: Path) -> int:
     import imageio_ffmpeg
 
     try:
-        return imageio_ffmpeg.count_frames_and_secs(str(video))[0]
+        return imageio_ffmpeg.count_frames_and_secs(str(video.absolute()))[0]
     except RuntimeError:
         return 0
 

@@ -24,11 +24,11 @@ from physics3d.checks import (
     Every,
     Frames,
     Length,
+    Name,
     Pixels,
     Positive,
     Rate,
     Seed,
-    Text,
     require_fields,
 )
 from physics3d.scenes.base import AbstractSource, Capture, Outline
@@ -42,7 +42,7 @@ from physics3d.world import World
 
 @dataclass(frozen=True, kw_only=True)
 class MadeTwin(AbstractSource):
-    name: Text
+    name: Name
     moving: Mapping[str, AbstractShape]  # what sways, shape by shape, under names of one's own
     still: Mapping[str, AbstractShape] = field(default_factory=dict)  # what stands around it
     world: World  # the truth

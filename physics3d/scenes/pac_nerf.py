@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from physics3d.checks import Colour, Factor, Positive, Text, Whole
+from physics3d.checks import Colour, Factor, Name, Positive, Text, Whole
 from physics3d.gaussians.cameras import Camera
 from physics3d.scenes.axes import OPENGL_TO_OPENCV, Axes, rigid_inverse
 from physics3d.scenes.base import AbstractSource, Capture, Take
@@ -32,7 +32,7 @@ from physics3d.scenes.posed import pinhole, where
 
 @dataclass(frozen=True, kw_only=True)
 class PacNerfSource(AbstractSource):
-    name: Text
+    name: Name
     path: Text  # the folder that holds all_data.json and data/
     truth: dict[str, float]  # material parameters as reported, SI; {} if unknown
     truth_source: str = ""  # who reports them, and what others recovered

@@ -60,6 +60,7 @@ def read_photograph(
         planes = [color * matte + 255 * (1 - matte) * np.asarray(background, np.float32), 255 * alpha]
     if camera.skew or any((*camera.radial, *camera.denominator, *camera.tangential)):
         remarks = (*remarks, "undistorted")
+    remarks = (*picture.remarks, *remarks)
     planes, pinhole = undistorted(planes, camera, str(path))
     shrunk = [_shrink(plane, resolution) for plane in planes]
     return Photograph(

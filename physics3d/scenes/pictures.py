@@ -4,12 +4,13 @@ What a file stores, and what it means here:
 
     8 bits, palette, CMYK, ...          0..255, black to white, as it is
     16 bits                             0..65535
+                                        (14 bits or fewer in them: taken as they are, and said)
     floating point                      0..1; 0..255 or 0..65535 where the largest number leaves no other reading
     alpha, also of a palette            0..1, the matte; colours multiplied by it in the file are divided again
 
 The turn is the EXIF orientation 1..8 (1: none). It is not applied here: a camera file may speak of the picture as it
 is stored or as it is shown, and only whoever knows the camera can tell. Pillow reads the files, OpenCV those that
-Pillow cannot (16 bits or floating point with several channels).
+Pillow cannot (16 bits or floating point with several channels), or would cut to 8 bits.
 """
 
 from dataclasses import dataclass
@@ -36,6 +37,7 @@ UNREAD = (
     ".exr",
 )  # formats to convert
 TURN = 0x0112  # the EXIF tag of the orientation
+NARROW = 16383  # a picture of 16 bits with no larger number is dark, or of a camera of 12 or 14 bits
 BELOW = 0.2  # how far below black a number may be, as a share of white: sharpening and cubic sampling ring
 QUARTER = (5, 6, 7, 8)  # orientations that exchange width and height
 
@@ -45,6 +47,7 @@ class Picture:
     color: Float32[np.ndarray, "h w 3"]  # 0..255, sRGB, as stored
     alpha: Float32[np.ndarray, "h w"] | None  # 0..1; None where the file has none
     turn: int  # EXIF orientation, 1..8
+    remarks: tuple[str, ...] = ()  # what the user should know of how the file was read
 
     @property
     def size(self) -> tuple[int, int]:
@@ -60,7 +63,7 @@ class Picture:
     def shown(self) -> "Picture":
         """The picture as a viewer shows it, with nothing left to turn."""
         alpha = None if self.alpha is None else _turned(self.alpha, self.turn)
-        return Picture(color=_turned(self.color, self.turn), alpha=alpha, turn=1)
+        return Picture(color=_turned(self.color, self.turn), alpha=alpha, turn=1, remarks=self.remarks)
 
 
 def read_picture(path: Path) -> Picture:
@@ -76,8 +79,9 @@ def read_picture(path: Path) -> Picture:
     turn = 1
     try:
         with Image.open(path) as file:
+            has_more = _loses_bits(file)  # asked before anything is read: then Pillow no longer knows
             turn = file.getexif().get(TURN, 1)
-            stored = _from_pillow(file)
+            stored = _from_opencv(path) if has_more else _from_pillow(file)
     except UnidentifiedImageError:
         stored = _from_opencv(path)
     except Exception as error:  # PIL raises OSError, SyntaxError, zlib.error, DecompressionBombError, struct.error ...
@@ -87,7 +91,11 @@ def read_picture(path: Path) -> Picture:
     color = _to_255(stored, path)
     alpha = color[..., -1] / 255 if stored.shape[-1] in (2, 4) else None
     color = np.repeat(color[..., :1], 3, -1) if stored.shape[-1] <= 2 else color[..., :3]
-    return Picture(color=np.ascontiguousarray(color), alpha=alpha, turn=turn if turn in range(1, 9) else 1)
+    wide = stored.dtype.kind in "iu" and stored.dtype.itemsize > 1
+    narrow = wide and 0 < int(stored.max(initial=0)) <= NARROW
+    remarks = ("dark: of 16 bits, of which 14 or fewer are used; if the camera has no more, scale them up",) * narrow
+    turn = turn if turn in range(1, 9) else 1
+    return Picture(color=np.ascontiguousarray(color), alpha=alpha, turn=turn, remarks=remarks)
 
 
 def is_picture(path: Path) -> bool:
@@ -101,6 +109,12 @@ def is_picture(path: Path) -> bool:
             return True
     except Exception:
         return False
+
+
+def _loses_bits(file) -> bool:
+    """Whether Pillow would keep the upper byte of 16 bits alone, as it does of PNG with several channels."""
+    raw = file.tile[0][3] if file.tile else ""
+    return file.mode in ("RGB", "RGBA", "LA") and "16" in str(raw[0] if isinstance(raw, tuple) else raw)
 
 
 def _from_pillow(file) -> np.ndarray:

@@ -15,7 +15,7 @@ from annotated_types import Ge, Gt, Le, Lt
 from jaxtyping import Float64
 from torch import Tensor
 
-from physics3d.checks import Colour, Count, Direction, Pixels, Positive, Text, require_fields
+from physics3d.checks import Colour, Count, Direction, Name, Pixels, Positive, Text, require_fields
 from physics3d.gaussians.model import Gaussians
 from physics3d.gaussians.ply import read_ply
 from physics3d.gaussians.render import render
@@ -29,7 +29,7 @@ from physics3d.scenes.studio import ring
 
 @dataclass(frozen=True, kw_only=True)
 class PlyScene(AbstractSource):
-    name: Text
+    name: Name
     path: Text  # the .ply file
     up: Direction  # up in the file's coordinates; models trained on COLMAP often have (0, -1, 0)
     scale: Positive  # metres per unit of the file [m]

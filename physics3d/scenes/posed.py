@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float32, Float64
 from torch import Tensor
 
-from physics3d.checks import Colour, Direction, Every, Factor, Positive, Text, require_fields
+from physics3d.checks import Colour, Direction, Every, Factor, Name, Positive, Text, require_fields
 from physics3d.gaussians.cameras import Camera
 from physics3d.scenes.axes import Axes
 from physics3d.scenes.base import AbstractSource, Capture
@@ -43,7 +43,7 @@ class Points:
 
 @dataclass(frozen=True, kw_only=True)
 class AbstractPosedSource(AbstractSource):
-    name: Text
+    name: Name
     path: Text
     up: Direction | None = None  # in the source's axes; None: how the cameras were held, or the floor's
     scale: Positive | None = None  # metres per unit [m]; None: so that the cameras are 1 m from what they look at

@@ -320,7 +320,7 @@ def _pycolmap():
         ) from error
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, handler)  # COLMAP's would end the process with a stack of C++
-    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value  # what failed is said by us, in one line
     return pycolmap
 
 

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from annotated_types import Ge, Le
 
-from physics3d.checks import Colour, Direction, Every, Length, Pixels, Rate, Seed, Text, require_fields
+from physics3d.checks import Colour, Direction, Every, Length, Name, Pixels, Rate, Seed, Text, require_fields
 from physics3d.motion.clip import read_clip
 from physics3d.scenes.axes import Axes
 from physics3d.scenes.base import AbstractSource, Capture, Take
@@ -40,7 +40,7 @@ CLIPS = "clips"  # the subfolder of what moves
 
 @dataclass(frozen=True, kw_only=True)
 class ThingSource(AbstractSource):
-    name: Text
+    name: Name
     path: Text  # the folder of photographs, or of one video around the thing, with the subfolder clips
     camera_distance: Length  # of the photographs from what they look at, in the middle [m]; sets the size of everything
     fps: Rate | None = None  # of the clips [1/s]; None: what their files say

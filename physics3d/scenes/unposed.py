@@ -15,7 +15,7 @@ from typing import Annotated
 import numpy as np
 from annotated_types import Ge, Le
 
-from physics3d.checks import Colour, Direction, Every, Length, Pixels, Seed, Text, require_fields
+from physics3d.checks import Colour, Direction, Every, Length, Name, Pixels, Seed, Text, require_fields
 from physics3d.scenes.base import AbstractSource, Capture
 from physics3d.scenes.colmap import ColmapSource
 from physics3d.scenes.frames import VIDEOS, sharpest_frames
@@ -28,7 +28,7 @@ NARROW = 30.0  # angle around the thing below which it is warned [deg]
 
 @dataclass(frozen=True, kw_only=True)
 class UnposedSource(AbstractSource):
-    name: Text
+    name: Name
     path: Text  # folder of photographs, or a video file
     camera_distance: Length  # of the cameras from what they look at, in the middle [m]; sets the size of everything
     # taken from a video: the sharpest of each of so many stretches; a folder is used whole
@@ -200,8 +200,10 @@ def _copies(
 
     called: dict[str, str] = {}
     with_matte, with_none = [], []
+    remarks: Counter[str] = Counter()
     for path in log.progress(photographs_below(folder, log, without=without), "reading photographs"):
         picture = read_picture(path).shown()
+        remarks.update(picture.remarks)
         matte = picture.alpha
         if matte is None:
             with_none.append(path.name)
@@ -225,6 +227,8 @@ def _copies(
             f"{with_none[0]} has no alpha channel, but {with_matte[0]} has one that hides something; give all "
             "photographs a matte or none"
         )
+    for remark, count in remarks.items():
+        log.info(f"{count} of {len(called)} photographs are {remark}")
     return called
 
 

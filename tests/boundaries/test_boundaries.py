@@ -157,11 +157,11 @@ def test_inclined_ground_stops_a_block_by_friction_below_the_angle_and_not_above
     assert abs(speed[0.6]) < 0.1 * slide
 
 
-def dropped(plane: float, *, gap: float, speed: float, seconds: float, frames: int, **changes):
-    """A bar of 2 x 2 x 8 cells with a wave speed of 10 m/s that falls onto separating ground, `plane` cells above a
-    node; heights [frames] of its lower and upper face above the ground [cells], and the trajectory."""
+def dropped(plane: float, *, gap: float, speed: float, seconds: float, frames: int, onto=None, **changes):
+    """A bar of 2 x 2 x 8 cells with a wave speed of 10 m/s that falls onto separating ground, or `onto` something,
+    `plane` cells above a node; heights [frames] of its lower and upper face above that [cells], and the trajectory."""
     dx = 0.05
-    ground = HalfSpace(point=(0.0, 0.0, plane * dx), normal=(0.0, 0.0, 1.0), kind="separate")
+    ground = onto or HalfSpace(point=(0.0, 0.0, plane * dx), normal=(0.0, 0.0, 1.0), kind="separate")
     world = soft_world(boundaries=(ground,), dx=dx, start=dict(youngs_modulus=1e5, poissons_ratio=0.0), **changes)
     position, volume = block((2, 2, 8), dx, lower=(0.0, 0.0, (plane + gap) * dx))
     with torch.no_grad():
@@ -188,6 +188,25 @@ def test_falling_bar_meets_separating_ground_at_its_plane_and_leaves_after_the_t
     # half a cell of too much or too little in 8, on the way up and down; nodes that act by themselves take 2 H/c longer
     assert 0.002 * (last - first) == pytest.approx(2 * 0.4 / 10, rel=0.2)
     assert float(momentum[-1]) > 0.8 * 0.5 * 1000 * 0.1 * 0.1 * 0.4
+
+
+@pytest.mark.parametrize("plane", [0.0, 0.3, 0.49, 0.6, 0.9])
+@pytest.mark.parametrize("rises", [False, True])
+def test_a_plate_meets_the_material_at_its_face_wherever_the_grid_lies(plane, rises):
+    """A bar falls onto a plate at rest, or a plate rises against a bar at rest: seen from either, the same."""
+    face, speed = plane * 0.05, 0.5
+    plate = MovingCuboid(
+        lower=(-1, -1, face - 0.5), upper=(1, 1, face), velocity=(0, 0, speed if rises else 0), duration=1.0
+    )
+    lower, _, trajectory = dropped(
+        plane, gap=2.0, speed=0.0 if rises else speed, seconds=0.3, frames=151, onto=plate, lower=(-0.5,) * 3,
+        upper=(0.9,) * 3,
+    )  # fmt: skip
+    force = torch.tensor(trajectory.health["momentum_z"], dtype=torch.float64).diff()
+    first = int((force > 0.02 * force.max()).nonzero()[0])
+    gone = speed * 0.002 * torch.arange(len(lower)) / 0.05 if rises else torch.zeros(len(lower))  # of the plate [cells]
+    # they come nearer by 0.02 cells per frame; a face that jumps from node to node meets 0.1 to 1.1 cells early
+    assert abs(float((lower - gone)[first])) < 0.05
 
 
 # both schemes have the same boundaries and nodes: one plane between nodes tells whether the implicit one obeys them

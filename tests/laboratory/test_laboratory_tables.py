@@ -36,6 +36,8 @@ BAD = {
     "there is a column 'force [N]'": GOOD.replace("nominal stress [kPa]", "force [N]"),
     "line 3: stretch is nan": GOOD.replace("1,1.1,2", "1,nan,2"),
     "line 3: stretch is 'much', no number": GOOD.replace("1,1.1,2", "1,much,2"),
+    "line 3: stretch is '1_1', no number": GOOD.replace("1,1.1,2", "1,1_1,2"),
+    "is no csv": GOOD.replace("1,1.1,2", "1,1.1," + "2" * 200_000),
     "line 3: 4 cells for 3 columns": GOOD.replace("1,1.1,2", "1,1.1,2,5"),
     "line 4: time 1 s does not increase": GOOD.replace("2,1.2,3", "1,1.2,3"),
     "columns nominal stress and true stress are both there": GOOD.replace("[kPa]", "[kPa],true stress [Pa]"),
@@ -58,6 +60,14 @@ def test_what_cannot_be_is_one_line(tmp_path, message):
         read_folder(tmp_path)
     text = str(error.value)
     assert message in text and text.startswith("pull.csv") and "\n" not in text and ";" in text
+
+
+def test_what_systems_leave_beside_a_table_is_no_table(tmp_path):
+    written(tmp_path, GOOD)
+    for name in ("._pull.csv", "~$pull.csv", ".hidden.csv"):
+        (tmp_path / name).write_bytes(b"\x00\x05\x16\x07")
+    (tmp_path / "folder.csv").mkdir()
+    assert [test.name for test in read_folder(tmp_path)] == ["pull"]
 
 
 def test_a_folder_without_tables_is_said(tmp_path):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import subprocess
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from clips import FPS, decaying, encode, swaying
 from physics3d.log import Log
 from physics3d.motion.clip import read_clip
 from physics3d.motion.usable import check_clip
-from physics3d.scenes.clips import filmed_takes
+from physics3d.scenes.clips import clip_files, filmed_takes
 from physics3d.video import ffmpeg
 
 SECONDS = 2.0
@@ -87,6 +88,32 @@ def test_what_is_no_clip_is_refused_in_one_line(tmp_path, sway):
             read_clip(tmp_path / name)
         assert "\n" not in str(error.value)
     assert len(read_clip(tmp_path / "bare.h264", fps=30).frames) == 12
+
+
+@pytest.mark.parametrize("name", ["a:b.mp4", "-y.mp4", "p%04d (1).mp4", "concat:x|y.mp4"])
+def test_no_name_is_a_protocol_or_an_option_of_ffmpeg(tmp_path, sway, name, monkeypatch):
+    encode(sway[:12], tmp_path / "clip.mp4")
+    (tmp_path / "clip.mp4").rename(tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+    assert len(read_clip(Path(name)).frames) == 12
+
+
+def test_what_was_cut_off_while_it_was_copied_is_refused(tmp_path, sway):
+    encode(sway, tmp_path / "whole.mp4", "-c:v", "libx264", "-movflags", "+faststart")
+    whole = (tmp_path / "whole.mp4").read_bytes()
+    (tmp_path / "half.mp4").write_bytes(whole[: 6 * len(whole) // 10])
+    with pytest.raises(ValueError, match=r"half\.mp4 is damaged after \d+ frames .*; copy it again") as error:
+        read_clip(tmp_path / "half.mp4")
+    assert "\n" not in str(error.value)
+
+
+def test_what_is_shorter_than_its_file_says_is_read_and_that_is_said(tmp_path, sway):
+    encode(sway, tmp_path / "whole.mkv", "-c:v", "libx264")
+    whole = (tmp_path / "whole.mkv").read_bytes()
+    (tmp_path / "half.mkv").write_bytes(whole[: len(whole) // 2])
+    clip = read_clip(tmp_path / "half.mkv")
+    assert 8 < len(clip.frames) < 50 and "it may be cut short" in clip.notes[0] and "2.00 s" in clip.notes[0]
+    assert read_clip(tmp_path / "whole.mkv").notes == ()
 
 
 def test_without_ffmpeg_the_remedy_is_named(tmp_path, sway, monkeypatch):
@@ -196,6 +223,20 @@ def test_takes_of_a_folder_are_one_to_learn_and_others_to_predict(tmp_path, sway
         takes[0].seen_by(dataclasses.replace(camera, width=64))
     with pytest.raises(ValueError, match="no clip"):
         filmed_takes(tmp_path / "empty", log=Log(None))
+
+
+def test_clips_of_a_folder_are_files_that_fit_and_have_names_of_their_own(tmp_path):
+    for name in ("b.mp4", "a (1).mp4", "._a.mp4", "notes.txt"):
+        (tmp_path / name).touch()
+    (tmp_path / "folder.mp4").mkdir()
+    assert [p.name for p in clip_files(tmp_path)] == ["a (1).mp4", "b.mp4"]
+    assert [p.name for p in clip_files(tmp_path, "a (?).mp4")] == ["a (1).mp4"]
+    for pattern in ("/*", "c*", "[", "../*"):
+        with pytest.raises(ValueError, match="holds no clip"):
+            clip_files(tmp_path, pattern)
+    (tmp_path / "b.MOV").touch()
+    with pytest.raises(ValueError, match=r"b\.MOV and b\.mp4, whose takes would have one name"):
+        clip_files(tmp_path)
 
 
 @pytest.mark.parametrize("thing", ["carnation", "telephone"])

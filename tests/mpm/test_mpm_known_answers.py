@@ -31,15 +31,16 @@ def test_every_problem_is_tested_somewhere():
     assert {case[0] for case in CASES} | {"vibrating bar", "viscoelastic bar"} == set(known_answers.PROBLEMS)
 
 
-@pytest.mark.parametrize(("cells", "cfl"), [(2, 0.5), (4, 0.5)])
-def test_momenta_of_a_spinning_body_do_not_drift_in_single_precision(cells, cfl):
-    """Over thousands of substeps."""
+@pytest.mark.parametrize(("cells", "cfl", "angular"), [(2, 0.5, 1e-6), (4, 0.5, 1e-6), (2, 0.2, 2e-6), (3, 0.2, 2e-6)])
+def test_momenta_of_a_spinning_body_do_not_drift_in_single_precision(cells, cfl, angular):
+    """Over 1600 to 6000 substeps."""
     answer = known_answers.spinning(cells, cfl=cfl, precision="float32")
     assert answer.substeps > 1500
-    # what is rounded of 64 and of 512 particles walks to 5e-7; sums in single precision walked to 2e-6, and a spin that
-    # every substep multiplies by what is rounded of dx drifted by 2e-5
+    # velocities of nodes and of particles are rounded once a substep, which walks to 4e-7 (docs/method.md, section 3);
+    # sums in single precision walked to 2e-6, and a spin that every substep multiplies by what is rounded of dx drifted
+    # by 2e-5. Places are rounded as well, which turns the body: 1.0e-6 rms of eight runs with 4000 substeps
     assert answer.more["linear"] < 1e-6
-    assert answer.more["angular"] < 1e-6
+    assert answer.more["angular"] < angular
 
 
 def test_disks_keep_their_momentum_and_gain_no_energy():

@@ -105,7 +105,7 @@ def test_a_scene_that_was_not_run_names_the_command(scene, tmp_path, monkeypatch
     monkeypatch.setattr(filed, "compose", lambda words: (scene | {"output": str(tmp_path)}, {}))
     words = ["scene=a b", "profile=smoke", "method=physics3d", "seed=1", "output=it's"]
     for module in (export, film):
-        assert module.main(words, {"FORMAT": "ply", "OUT": str(tmp_path / "out")}) == 1
+        assert module.main(words, {"FORMAT": "ply", "OUT": str(tmp_path / "out.mp4")}) == 1
         wrong = capsys.readouterr().err
         assert "not computed yet" in wrong and wrong.count("\n") == 1
         said = shlex.split(wrong.partition("; ")[2])

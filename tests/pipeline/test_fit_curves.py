@@ -69,7 +69,8 @@ def test_a_folder_becomes_a_material(folder, capsys):
     [
         ({}, 2, "DATA is not given"),
         ({"DATA": "here"}, 2, "MATERIAL is not given"),
-        ({"MATERIAL": "rubbber"}, 1, "MATERIAL is 'rubbber'; take one of"),
+        ({"MATERIAL": "../rubber"}, 2, "MATERIAL is '../rubber'; take one of"),
+        ({"MATERIAL": "rubbber"}, 2, "MATERIAL is 'rubbber'; take one of"),
         ({"MATERIAL": "viscoelastic", "UNSEEN": "creep"}, 1, "UNSEEN names 'creep'; the tests are larger, small"),
         ({"MATERIAL": "viscoelastic", "UNSEEN": "small,larger"}, 1, "UNSEEN names every test"),
         ({"MATERIAL": "drucker_prager"}, 1, "friction_angle is no modulus"),

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from toy import ALL, configuration
 
-from pipeline.flow import first, left_out, plan, suit
+from pipeline.flow import built, first, left_out, plan, suit
 from pipeline.page import STAGES
 from pipeline.settings import choices, compose
 from pipeline.stage import StageError, build, run
@@ -190,6 +190,12 @@ def test_bad_value_is_found_before_anything_runs(folder, prefect):
     _, err = process.communicate()
     assert process.returncode == 1 and "error: evaluate.tolerance: Compare has no such field" in err
     assert not (folder / "artifacts" / "capture").exists()
+
+
+def test_a_missing_ffmpeg_is_found_before_anything_runs(tmp_path, monkeypatch):
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(tmp_path / "nowhere"))
+    with pytest.raises(StageError, match=r"no ffmpeg found .*; run `make setup`"):
+        built(configuration(tmp_path), "cpu")
 
 
 @pytest.mark.parametrize("name", [signal.SIGINT, signal.SIGTERM])

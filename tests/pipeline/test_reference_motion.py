@@ -8,8 +8,9 @@ from pipeline.reference_motion import main
 @pytest.mark.parametrize(
     "words, code, line",
     [
-        (["scene=carnation", "edge=long"], 2, "edge is a length in m"),
-        (["scene=carnation", "steps=2.5"], 2, "steps a whole number"),
+        *((["scene=carnation", f"edge={x}"], 2, f"edge={x}: take an edge of") for x in ("long", "nan", "0", "-1")),
+        *((["scene=carnation", f"steps={n}"], 2, "a whole number of 1 to 1000") for n in ("2.5", "0", "-1", "")),
+        (["scene=trained", "data=a, (b"], 1, "scene.source is a PlyScene"),
         (["scene=ball"], 1, "scene.source is a BallTwin"),
         (["scene=nothing"], 2, "nothing"),
     ],

@@ -76,3 +76,5 @@ def test_what_cannot_be_compared_is_one_line(folder, capsys, real, predicted, me
 def test_what_is_not_given_is_named(capsys):
     assert main({"REAL": "a.mp4"}) == 2 and "PRED is not given" in capsys.readouterr().err
     assert main({}) == 2 and "REAL is not given" in capsys.readouterr().err
+    for nothing in (".", "/", ".."):  # they have no name that a folder could be called after
+        assert main({"REAL": nothing, "PRED": nothing}) == 1 and "no clip at" in capsys.readouterr().err

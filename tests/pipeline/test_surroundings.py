@@ -2,14 +2,19 @@
 
 import os
 import resource
+import sqlite3
 import subprocess
 import sys
+import tempfile
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
+from pipeline import __main__ as command
+from pipeline import sweep as sweeps
 from pipeline.__main__ import _kernels
-from pipeline.server import HERE, _go_round_proxies, server
+from pipeline.server import HERE, _go_round_proxies, _set_aside, server
 from pipeline.stage import StageError
 
 ROOT = Path(__file__).resolve().parent.parent.parent
@@ -71,8 +76,75 @@ def test_a_server_without_a_home_is_an_error_not_a_wait(tmp_path, environment):
     environment.pop("PREFECT_API_URL", None)
     environment.pop("PREFECT_HOME", None)
     (tmp_path / "home").write_text("x")
-    with pytest.raises(OSError, match="home"), server(tmp_path / "home", meanwhile=lambda: None):
+    (tmp_path / "other" / "start.lock").mkdir(parents=True)
+    for name, reason in (("home", "File exists"), ("other", "Is a directory")):
+        environment.pop("PREFECT_HOME", None)
+        said = f"cannot keep its database in {tmp_path / name} \\({reason}.*; remove that, or set PREFECT_HOME="
+        with pytest.raises(OSError, match=said), server(tmp_path / name, meanwhile=lambda: None):
+            pass
+
+
+def test_a_server_that_ends_by_itself_is_an_error_not_a_wait(tmp_path, environment):
+    """As where its disk is full: the database cannot be made."""
+    for name in ("PREFECT_API_URL", "PREFECT_HOME"):
+        environment.pop(name, None)
+    (tmp_path / "prefect.db-journal").mkdir()  # no file can be made there
+    said = r"the Prefect server did not start; see .*server\.log"
+    with pytest.raises(RuntimeError, match=said), server(tmp_path, meanwhile=lambda: None):
         pass
+    assert "Traceback" in (tmp_path / "server.log").read_text()  # it said why, and ended
+
+
+@pytest.mark.parametrize("kind", ["text", "cut", "folder", "link"])
+def test_what_is_no_database_of_prefect_is_set_aside_with_a_word(tmp_path, capsys, kind):
+    file = tmp_path / "prefect.db"
+    match kind:
+        case "text":
+            file.write_text("this is no database")
+        case "cut":
+            file.write_bytes(b"SQLite")
+        case "folder":
+            file.mkdir()
+        case "link":
+            file.symlink_to(tmp_path / "nowhere")
+    (tmp_path / "prefect.db-wal").write_text("x")
+    _set_aside(file)
+    (aside,) = tmp_path.iterdir()
+    assert aside.name.startswith("prefect.db.damaged-") and str(aside) in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("content", [b"", None])
+def test_a_database_of_prefect_is_left_in_its_place(tmp_path, content):
+    file = tmp_path / "prefect.db"
+    if content is None:
+        with closing(sqlite3.connect(file)) as made:
+            made.execute("create table runs (id)")
+    else:
+        file.write_bytes(content)
+    _set_aside(file)
+    assert list(tmp_path.iterdir()) == [file]
+
+
+def test_a_full_temporary_folder_is_said_at_once(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", "/dev/shm")
+    monkeypatch.setattr(command, "LEAST_TEMPORARY", 1 << 60)
+    assert command.main(["scene=ball", "profile=smoke", f"output={tmp_path}"]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "MB are free in /dev/shm); set TMPDIR=<folder>" in line
+
+
+@pytest.mark.parametrize("place", ["file", "file/below", "full"])
+@pytest.mark.parametrize("sweep", [False, True])
+def test_a_place_where_no_results_can_be_kept_is_said_at_once(tmp_path, capsys, place, sweep):
+    (tmp_path / "file").write_text("x")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "artifacts").write_text("x")
+    words = ["profile=smoke", f"output={tmp_path / place}"]
+    assert sweeps.main(["scenes=ball", *words]) == 1 if sweep else command.main(["scene=ball", *words]) == 1
+    told = capsys.readouterr()
+    (line,) = told.err.splitlines()
+    assert line.startswith(f"error: results cannot be kept in {tmp_path / place / 'artifacts'} (")
+    assert line.endswith("; say output=<a folder that can be written>") and told.out == ""
 
 
 def test_kernels_are_kept_where_one_can_write(tmp_path, environment):

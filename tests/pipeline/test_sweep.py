@@ -117,6 +117,13 @@ def test_every_combination_is_a_variant():
         (["scenes=ball", "runner=cloud"], r"runner is 'cloud'; take one of thread, process, dask, ray"),
         (["scenes=ball", "workers=0"], r"workers is '0'; take a number from 1 to 9999"),
         (["scenes=ball", "runner=process", "address=tcp://x:1"], r"address=tcp://x:1: runner=process stays on this"),
+        *(
+            (
+                ["scenes=ball", "runner=dask", f"address={text}"],
+                r"is none of a cluster; take address=tcp://<host>:<port>",
+            )
+            for text in ("tcp://[bad:1", "tcp://127.0.0.1:99999", "tcp://host", "host:8786", "tcp://host:x", "//")
+        ),
     ],
 )
 def test_a_mistake_is_one_line_with_the_remedy(words, message):

@@ -66,6 +66,23 @@ def test_no_path_means_anything_to_hydra_or_omegaconf(path):
     assert OmegaConf.to_container(config, resolve=True) == {"data": f"/{path}", "file": f"/{path}/x"}
 
 
+@pytest.mark.parametrize("text", [p for p in PATHS if p not in ("null", "true", "[1,2]", "-rf.ply", "~")])
+def test_any_text_that_is_no_number_arrives_as_it_stands(text):
+    """Names of photographs and patterns of names, as browsers and telephones make them; sentences for a prior."""
+    config, _ = compose(literal_paths(["scene=thing", f"scene.prompts.0.view={text}", f"capture.clip={text}"]))
+    assert config["scene"]["prompts"][0]["view"] == config["capture"]["clip"] == text
+    config, _ = compose(
+        literal_paths(["scene=clip", "prior=wan", f"scene.source.pattern={text}", f"prior.prompt={text}"])
+    )
+    assert config["scene"]["source"]["pattern"] == config["prior"]["prompt"] == text
+
+
+@pytest.mark.parametrize("view", ["3", "-1", "1.5", "nan", "true", "[0]", "{a: 1}", "null"])
+def test_what_can_be_no_name_of_a_photograph_is_a_number_or_refused(view):
+    word = f"scene.prompts.0.view={view}"
+    assert literal_paths([word]) == [word]
+
+
 def test_which_words_are_paths():
     kept = ["learn.steps=5", "scene=bird", "~simulate.force.x", "scene.source.path=${data}/x", "world.dt=null", "data"]
     assert literal_paths(kept) == kept
@@ -120,6 +137,10 @@ def test_make_hands_on_what_it_was_given(made, text):
     assert made("ui", f"PORT={text}")[1]["PORT"] == text
     for target in ("test", "bench-speed"):
         assert made(target, f"ARGS={text}")[1]["ARGS"] == text
+    for target in ("score", "twin", "fit-curves", "export", "film", "still", "report", "train-prior"):
+        names = ("DATA", "OUT", "REAL", "PRED", "MATERIAL", "UNSEEN", "FORMAT", "FRAME", "SIZE", "LENGTH")
+        env = made(target, *(f"{name}={text}" for name in names))[1]
+        assert {env[name] for name in names} == {text}
 
 
 @pytest.mark.parametrize("text", [t for t in PATHS if "/" not in t and "%" not in t and "=" not in t])
@@ -127,6 +148,11 @@ def test_the_name_of_a_benchmark_runs_nothing(made, text):
     target = f"bench-{text}"
     if target.strip() == target and "\t" not in target and not set(target) & set("*?[\\~"):  # make's own patterns
         assert made(target)[0][-1] == f"benchmarks/{text}.py"
+
+
+def test_files_are_utf_8_whatever_the_locale_says(made):
+    for locale in ("C", "POSIX", "de_DE.ISO-8859-1"):
+        assert made("why", LC_ALL=locale)[1]["PYTHONUTF8"] == "1"
 
 
 def split(text: str) -> subprocess.CompletedProcess:

@@ -173,10 +173,12 @@ def test_a_folder_of_another_training_is_refused(tmp_path):
         train(bars(2)[:, :3], SMALL, options(), folder=tmp_path, log=Log(None))
 
 
-def test_words_that_are_no_options_are_refused(capsys):
+def test_words_that_are_no_options_are_refused(tmp_path, capsys):
     for words in (["stepps=3"], ["steps=0"], ["steps=many"], ["steps"]):
         assert train_prior.main(words, {}) == 2
         assert "make train-prior" in capsys.readouterr().err
+    assert train_prior.main(["device=cuda:77"], {"OUT": str(tmp_path)}) == 2  # before any film is made
+    assert "device=cuda:77: not available here" in capsys.readouterr().err and not any(tmp_path.iterdir())
 
 
 # ---- the prior

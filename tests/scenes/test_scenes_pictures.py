@@ -37,9 +37,10 @@ CASES = {
     "grey16.png": (lambda f: cv2.imwrite(str(f), GREY.astype(np.uint16) * 257), GREY, 1e-3),
     "grey16.tif": (lambda f: Image.fromarray(GREY.astype(np.uint16) * 257).save(f), GREY, 1e-3),
     "grey16.pgm": (lambda f: cv2.imwrite(str(f), GREY.astype(np.uint16) * 257), GREY, 1e-3),
-    # Pillow keeps the upper byte of three channels
-    "rgb16.png": (lambda f: cv2.imwrite(str(f), RAMP[..., ::-1].astype(np.uint16) * 257), RAMP, 1),
-    "rgb16.tif": (lambda f: cv2.imwrite(str(f), RAMP[..., ::-1].astype(np.uint16) * 257), RAMP, 1),
+    # Pillow would keep the upper byte of three channels
+    "rgb16.png": (lambda f: cv2.imwrite(str(f), RAMP[..., ::-1].astype(np.uint16) * 257), RAMP, 1e-3),
+    "rgb16.tif": (lambda f: cv2.imwrite(str(f), RAMP[..., ::-1].astype(np.uint16) * 257), RAMP, 1e-3),
+    "dark16.png": (lambda f: cv2.imwrite(str(f), RAMP[..., ::-1].astype(np.uint16)), RAMP / 257, 1e-3),
     "unit_float.tif": (lambda f: Image.fromarray(GREY.astype(np.float32) / 255).save(f), GREY, 1e-3),
     "byte_float.tif": (lambda f: Image.fromarray(GREY.astype(np.float32)).save(f), GREY, 1e-3),
     "rgb_float.tif": (lambda f: cv2.imwrite(str(f), RAMP[..., ::-1].astype(np.float32) / 255), RAMP, 1e-3),

@@ -173,6 +173,39 @@ def test_images_txt_with_empty_second_lines_and_blank_lines_before_is_whole(tmp_
     assert_all_there(source(log=Log(None)))
 
 
+def length_of_first(part: str, data: bytes) -> int:
+    """Bytes of the first entry of a binary file: a PINHOLE camera, or an image with its name and key points."""
+    if part == "cameras":
+        return 24 + 8 * 4
+    name = data.index(b"\0", 72)
+    return name + 9 - 8 + 24 * int.from_bytes(data[name + 1 : name + 9], "little")
+
+
+@pytest.mark.parametrize("binary", [False, True])
+@pytest.mark.parametrize("part", ["cameras", "images"])
+def test_a_number_that_stands_twice_in_colmap_is_refused(part, binary, tmp_path):
+    """Points say by numbers of images where they are seen, images by numbers of cameras what took them."""
+    source = colmap(tmp_path, binary=binary)
+    file = tmp_path / "sparse/0" / (part + (".bin" if binary else ".txt"))
+    if binary:
+        data = file.read_bytes()
+        count, first = int.from_bytes(data[:8], "little"), data[8 : 8 + length_of_first(part, data)]
+        file.write_bytes((count + 1).to_bytes(8, "little") + data[8:] + first)
+    else:
+        lines = [line for line in file.read_text().split("\n") if not line.startswith("#")]
+        file.write_text("\n".join([*lines[:-1], *lines[: 2 if part == "images" else 1], ""]))
+    refused(source, rf"cannot read .*{file.name}.*: {part[:-1]} 1 is there twice, and each needs a number of its own")
+
+
+@pytest.mark.parametrize("part", ["cameras", "images", "points3D"])
+@pytest.mark.parametrize("more", [1, 64])
+def test_bytes_after_the_end_of_a_binary_file_are_refused(part, more, tmp_path):
+    source = colmap(tmp_path, binary=True)
+    file = tmp_path / "sparse/0" / f"{part}.bin"
+    file.write_bytes(file.read_bytes() + bytes(more))
+    refused(source, rf"cannot read .*{part}\.bin: {more} bytes are left after its last entry; the file is damaged")
+
+
 # ---- lenses
 
 
@@ -348,6 +381,21 @@ def test_a_turn_that_the_camera_file_leaves_open_is_refused_with_the_reason(turn
     source = transforms(tmp_path, blender=blender)
     store_turned(tmp_path / "images", turn)
     refused(source, f"carries the EXIF turn {turn}, and the camera file does not tell")
+
+
+@pytest.mark.parametrize("bits, said_so", [(10, True), (12, True), (14, True), (16, False)])
+def test_fewer_bits_than_their_file_has_are_said_and_not_scaled(bits, said_so, tmp_path):
+    """A camera of 12 bits and a dark picture of 16 look alike: only who took them knows."""
+    import cv2
+
+    source = colmap(tmp_path)
+    for file in (tmp_path / "images").iterdir():
+        picture = np.asarray(Image.open(file)).astype(np.float64) / 255
+        picture[0, 0] = 1
+        cv2.imwrite(str(file), np.round(picture * (2**bits - 1)).astype(np.uint16))
+    capture, text = said(source, tmp_path)
+    assert ("5 of 5 images are dark: of 16 bits, of which 14 or fewer are used" in text) == said_so
+    assert abs(int(capture.images[0].max()) - 255 * 2**bits / 2**16) < 1
 
 
 @pytest.mark.parametrize("white", [255, 1], ids=["0..255", "0..1"])
