@@ -95,7 +95,7 @@ def of_samples(
     n = round(len(offset) ** (1 / 3))
     number = _lumps(cell, inside.reshape(-1, n, n, n))
     links = _touching(cell, number)
-    number = number.reshape(len(cell), -1)
+    number = number.reshape(len(cell), n**3)  # a sheet has no cell
     which, lump = np.nonzero(number >= 0)[0], number[number >= 0]
     _, first = np.unique(lump, return_index=True)
     at = which[first]  # the cell of every piece
