@@ -95,7 +95,7 @@ def of_samples(
     n = round(len(offset) ** (1 / 3))
     number = _lumps(cell, inside.reshape(-1, n, n, n))
     links = _touching(cell, number)
-    number = number.reshape(len(cell), -1)
+    number = number.reshape(len(cell), n**3)  # a sheet has no cell
     which, lump = np.nonzero(number >= 0)[0], number[number >= 0]
     _, first = np.unique(lump, return_index=True)
     at = which[first]  # the cell of every piece
@@ -227,15 +227,25 @@ def points(matter: Matter) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return X.reshape(-1, 3), weight.reshape(-1), np.repeat(np.arange(len(X)), len(share))
 
 
-def with_particles(
-    matter: Matter, position: Float[np.ndarray, "n 3"], volume: Float[np.ndarray, " n"], moment: np.ndarray, first: int
+def with_pieces(
+    matter: Matter,
+    position: Float[np.ndarray, "n 3"],
+    volume: Float[np.ndarray, " n"],
+    moment: Float[np.ndarray, "n 3 3"],
+    owner: Int[np.ndarray, " n"],
+    *,
+    reach: float,
 ) -> Matter:
-    """`matter` and n more particles, numbered from `first` on, a piece each, linked by their distance."""
-    edge = matter.spacing if len(matter.position) else float(np.quantile(volume, 0.9)) ** (1 / 3)
+    """`matter` and n more pieces, linked by their distance: to each other within `reach` [m], to what there is already
+    within REACH of its particles."""
     old, m = matter.position.numpy(), len(matter.position)
-    pairs = cKDTree(np.concatenate([old, position])).query_pairs(REACH * edge, output_type="ndarray")
-    pairs = pairs[(pairs >= m).any(1)].astype(np.int64)
-    more = (position, volume, moment, np.arange(first, first + len(position)), pairs)
+    own = cKDTree(position)
+    pairs = own.query_pairs(reach, output_type="ndarray") + m
+    if m:
+        beside = own.query_ball_tree(cKDTree(old), REACH * matter.spacing)
+        to_old = [np.stack([np.full(len(near), m + i), near], 1) for i, near in enumerate(beside)]
+        pairs = np.concatenate([pairs, *to_old])
+    more = (position, volume, moment, owner.astype(np.int64), pairs.astype(np.int64).reshape(-1, 2))
     names = ("position", "volume", "moment", "owner", "links")
     return Matter(**{name: torch.cat([getattr(matter, name), torch.from_numpy(a)]) for name, a in zip(names, more)})
 

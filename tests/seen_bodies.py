@@ -58,11 +58,13 @@ class Round(AbstractSolid):
         return lambda x: np.linalg.norm(x, axis=1) < self.radius
 
 
-def filled(gaussians: Gaussians, cameras: list[Camera], label=None, solid: AbstractSolid = Poisson()):
+def filled(
+    gaussians: Gaussians, cameras: list[Camera], label=None, solid: AbstractSolid = Poisson(), spacing: float = SPACING
+):
     return fill(
         gaussians,
         torch.ones(len(gaussians), dtype=torch.int32) if label is None else label,
-        spacing=SPACING,
+        spacing=spacing,
         opacity=0.1,
         solid=solid,
         interior=True,

@@ -3,7 +3,8 @@
 A reconstruction puts Gaussians on the visible surface only; a simulated body needs mass behind it.
 
     chosen     the Gaussians that show a surface: above the opacity threshold, without floaters       (`showing`, here)
-    looked at  where the photographs' cameras see that surface, and what it stands on     (`seen.py`, `ground.py`)
+    looked at  where the photographs' cameras see that surface, and what it stands on     (`seen.py`, `ground.py`), at
+               the scale of the particles or of a thirtieth of the body: fewer particles fill the same body
     samples    of the surface, with outward normals                                                   (`surface.py`)
     inside     of the closed surface through the samples that bound a volume                           (`solids.py`)
     particles  one per lattice cell of that volume (`cells.py`), and one per spacing^2 of thin surface that no cell
@@ -28,7 +29,7 @@ from physics3d.filling.cells import solid_cells
 from physics3d.filling.ground import Ground, ground
 from physics3d.filling.pieces import ISOLATED, join_pieces
 from physics3d.filling.seen import LIMB, Seen, seen
-from physics3d.filling.sheets import disc_moment, sheet
+from physics3d.filling.sheets import APART, disc_moment, sheet
 from physics3d.filling.solids import AbstractSolid
 from physics3d.filling.surface import Surface, over_discs, sample_surface
 from physics3d.gaussians.cameras import Camera
@@ -36,9 +37,10 @@ from physics3d.gaussians.embedding import embed
 from physics3d.gaussians.floaters import lonely
 from physics3d.gaussians.model import Gaussians
 from physics3d.log import Log
-from physics3d.matter import of_owners, with_particles
+from physics3d.matter import REACH, of_owners, with_pieces
 
 MOST_CELLS = 160  # along one side of the lattice
+DETAIL = 30  # a body is looked at in at least so many parts along its longest side, however far apart its particles are
 FLOATING = 3.0  # standard deviations by which a Gaussian is farther from its neighbours than all are
 
 
@@ -76,17 +78,17 @@ def fill(
     moving = gaussians.select(which)
     reliable, opacity = showing(moving, opacity, log)
     shown = moving.select(reliable)
-    _check_size(shown, spacing)
+    detail = _detail(shown, spacing)
     static = gaussians.select((label == 0) & (gaussians.opacity > opacity))
 
-    view, below = _look(gaussians, label, shown, cameras, spacing=spacing, opacity=opacity, log=log)
-    surface, deviation = sample_surface(shown, spacing, beside=static, view=view, below=below, log=log)
-    inside = _bounded(solid.inside(surface, spacing), view, below, spacing)
+    view, below = _look(gaussians, label, shown, cameras, spacing=detail, opacity=opacity, log=log)
+    surface, deviation = sample_surface(shown, detail, beside=static, view=view, below=below, log=log)
+    inside = _bounded(solid.inside(surface, detail), view, below, detail)
     position, volume, matter = solid_cells(inside, surface.point, spacing)
     inner = cKDTree(surface.point).query(position)[0] > spacing if len(position) else np.zeros(0, bool)
 
     bare = _uncovered(surface, deviation, position, view, spacing)
-    flat, area = sheet(surface.point[bare], surface.normal[bare], spacing)
+    flat, area = sheet(surface.point[bare], surface.normal[bare], spacing, detail)
     thickness = sheet_thickness
     if thickness is None and bare.any():
         thickness = min(float(np.sqrt(12) * np.median(deviation[bare])), spacing)
@@ -100,10 +102,15 @@ def fill(
         position, volume, inner = position[~inner], volume[~inner], inner[~inner]
         log.info(f"interior left out: a shell of {volume.sum():.4g} m^3 stays")
     if len(flat):
-        side = surface.normal[bare][cKDTree(surface.point[bare]).query(flat)[1]]
         assert thickness is not None  # there is flat matter, so it was given or measured above
-        moment = disc_moment(side, area, thickness)
-        matter = with_particles(matter, flat, area * thickness, moment, len(position))
+        # in pieces as large as those of what is solid
+        edge = min(matter.size, spacing) if len(position) else spacing / 2
+        piece, share = sheet(surface.point[bare], surface.normal[bare], edge, detail)
+        side = surface.normal[bare][cKDTree(surface.point[bare]).query(piece)[1]]
+        of_flat = cKDTree(flat).query(piece)[1]
+        area = np.bincount(of_flat, weights=share, minlength=len(flat))
+        moment = disc_moment(side, share, thickness)
+        matter = with_pieces(matter, piece, share * thickness, moment, len(position) + of_flat, reach=APART * edge)
         position, volume = np.concatenate([position, flat]), np.concatenate([volume, area * thickness])
         inner = np.concatenate([inner, np.zeros(len(flat), bool)])
 
@@ -113,7 +120,8 @@ def fill(
     cubes = np.tile(spacing**2 / 12 * np.eye(3), (len(bridge), 1, 1))
     matter = of_owners(matter, keep)
     if len(bridge):
-        matter = with_particles(matter, bridge, np.full(len(bridge), spacing**3), cubes, int(keep.sum()))
+        number = int(keep.sum()) + np.arange(len(bridge))
+        matter = with_pieces(matter, bridge, np.full(len(bridge), spacing**3), cubes, number, reach=REACH * spacing)
     position = np.concatenate([position[keep], bridge])
     volume = np.concatenate([volume[keep], np.full(len(bridge), spacing**3)])
     inner = np.concatenate([inner[keep], np.zeros(len(bridge), bool)])
@@ -159,7 +167,11 @@ def showing(moving: Gaussians, opacity: float, log: Log) -> tuple[Int[Tensor, " 
     return reliable, opacity
 
 
-def _check_size(shown: Gaussians, spacing: float) -> None:
+def _detail(shown: Gaussians, spacing: float) -> float:
+    """The scale [m] at which the surface is looked at: that of the particles, but no coarser than the body needs, nor
+    finer than its Gaussians tell.
+
+    Raises ValueError if the body is too small or too large for the particles."""
     size = np.ptp(shown.mean.double().numpy(), 0)
     if size.max() < 2 * spacing:
         raise ValueError(
@@ -171,6 +183,8 @@ def _check_size(shown: Gaussians, spacing: float) -> None:
             f"fill.spacing = {spacing:g} m cuts a body of {size.max():.3g} m into more than {MOST_CELLS} cells; "
             f"take at least {size.max() / MOST_CELLS:.2g} m, or correct the segmentation"
         )
+    thickness = 2 * float(torch.exp(shown.log_scale.amin(1)).median())
+    return min(spacing, max(float(size.max()) / DETAIL, thickness))
 
 
 def _look(

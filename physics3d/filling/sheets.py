@@ -3,14 +3,18 @@
 import numpy as np
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
+# random sequential packing of discs leaves 1.44 diameter^2 to each: this diameter gives one spacing^2; neighbours are
+# less than two of them apart
+APART = 2 / np.sqrt(1.44)  # [spacings]
 
-def sheet(point: np.ndarray, normal: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Thin surface -> particles [s, 3] about a spacing apart, and the area [s] [m^2] that each stands for."""
+
+def sheet(point: np.ndarray, normal: np.ndarray, spacing: float, detail: float) -> tuple[np.ndarray, np.ndarray]:
+    """Thin surface, samples half of `detail` apart -> particles [s, 3] about a spacing apart, and the area [s] [m^2]
+    that each stands for."""
     if len(point) == 0:
         return np.zeros((0, 3)), np.zeros(0)
     tree = cKDTree(point)
-    # random sequential packing of discs leaves 1.44 diameter^2 to each: this diameter gives one spacing^2
-    radius = spacing / np.sqrt(1.44)
+    radius = APART / 2 * spacing
     free, chosen = np.ones(len(point), bool), []
     for i in range(len(point)):
         if free[i]:
@@ -18,9 +22,9 @@ def sheet(point: np.ndarray, normal: np.ndarray, spacing: float) -> tuple[np.nda
             free[tree.query_ball_point(point[i], radius)] = False
     position = point[chosen]
     _, owner = cKDTree(position).query(point)
-    area = np.bincount(owner, weights=sample_area(point, normal, spacing, tree), minlength=len(position))
+    area = np.bincount(owner, weights=sample_area(point, normal, detail, tree), minlength=len(position))
     lonely = area <= 0  # fewer than three samples close by: a thread; it counts as a square of one sample
-    return position, np.where(lonely, (spacing / 2) ** 2, area)
+    return position, np.where(lonely, (detail / 2) ** 2, area)
 
 
 def disc_moment(normal: np.ndarray, area: np.ndarray, thickness: float) -> np.ndarray:
@@ -29,15 +33,16 @@ def disc_moment(normal: np.ndarray, area: np.ndarray, thickness: float) -> np.nd
     return thickness**2 / 12 * across + area[:, None, None] / 12 * (np.eye(3) - across)
 
 
-def sample_area(point: np.ndarray, normal: np.ndarray, spacing: float, tree: cKDTree) -> np.ndarray:
-    """Area [m^2] of each sample: a third of the Delaunay triangles around it, among neighbours in its layer."""
+def sample_area(point: np.ndarray, normal: np.ndarray, detail: float, tree: cKDTree) -> np.ndarray:
+    """Area [m^2] of each sample, half of `detail` apart: a third of the Delaunay triangles around it, among neighbours
+    in its layer."""
     area = np.zeros(len(point))
-    _, neighbours = tree.query(point, k=min(20, len(point)), distance_upper_bound=1.5 * spacing)
+    _, neighbours = tree.query(point, k=min(20, len(point)), distance_upper_bound=1.5 * detail)
     tangent = np.linalg.svd(normal[:, None, :])[2][:, 1:, :]
     for i, row in enumerate(neighbours):
         row = row[row < len(point)]
         offset = point[row] - point[i]
-        flat = np.abs(offset @ normal[i]) < 0.5 * spacing  # other layers have their own area
+        flat = np.abs(offset @ normal[i]) < 0.5 * detail  # other layers have their own area
         planar = offset[flat] @ tangent[i].T
         if len(planar) < 3:
             continue
@@ -50,5 +55,5 @@ def sample_area(point: np.ndarray, normal: np.ndarray, spacing: float, tree: cKD
         sides = np.stack([np.linalg.norm(a - b, axis=1), np.linalg.norm(b - c, axis=1), np.linalg.norm(c - a, axis=1)])
         u, v = b - a, c - a
         triangle = 0.5 * np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
-        area[i] = triangle[sides.max(0) < 1.5 * spacing].sum() / 3
+        area[i] = triangle[sides.max(0) < 1.5 * detail].sum() / 3
     return area

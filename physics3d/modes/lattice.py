@@ -32,10 +32,18 @@ class Splines:
     count: int  # functions
 
     def at(
-        self, X: Float[np.ndarray, "n 3"], piece: Int[np.ndarray, " n"]
+        self,
+        X: Float[np.ndarray, "n 3"],
+        piece: Int[np.ndarray, " n"],
+        *,
+        continued_from: Float[np.ndarray, "n 3"] | None = None,
     ) -> tuple[sparse.csr_matrix, sparse.csr_matrix]:
-        """(N [n, count], gradient [3 n, count] in 1/m, row 3 i + a the derivative of point i along axis a)."""
-        spline, value, slope = _evaluate(X, self.H, self.origin, self.first, self.size)
+        """(N [n, count], gradient [3 n, count] in 1/m, row 3 i + a the derivative of point i along axis a).
+
+        `continued_from` are places [m] in the matter: the quadratic of their cell is continued to X, which lies beside
+        it, on a face or beyond. The cell of X itself may hold no matter; functions that end there would say anything.
+        """
+        spline, value, slope = _evaluate(X, self.H, self.origin, self.first, self.size, continued_from)
         key = spline * self.pieces + piece[:, None]
         place = np.minimum(np.searchsorted(self.key, key), len(self.key) - 1)
         known = self.key[place] == key
@@ -87,10 +95,11 @@ def splines(
     )
 
 
-def _evaluate(X, H, origin, first, size) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(number of the spline [n, 27], value [n, 27], gradient [n, 27, 3] 1/m) of the splines around every point."""
+def _evaluate(X, H, origin, first, size, inside=None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(number of the spline [n, 27], value [n, 27], gradient [n, 27, 3] 1/m) of the splines around every point, or of
+    the quadratics of the cell that `inside` [n, 3] lies in."""
     y = (X - origin) / H
-    cell = np.floor(y).astype(np.int64)
+    cell = np.floor(y if inside is None else (inside - origin) / H).astype(np.int64)
     f = y - cell
     value = np.stack([0.5 * (1 - f) ** 2, 0.5 + f * (1 - f), 0.5 * f**2], -1)  # [n, axis, 3]
     slope = np.stack([f - 1, 1 - 2 * f, f], -1) / H

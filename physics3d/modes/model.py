@@ -137,7 +137,8 @@ def model(
         if cell >= BLOCK:
             matter, block = in_blocks(single, cell / 2 * size)
         at, weight, piece = points(matter)
-        places = np.concatenate([at, *(p.position for p in pins), x.numpy()[free]])
+        centres = matter.position.numpy()
+        places = np.concatenate([at, *(centres[block[p.piece]] for p in pins), centres[block[seat[free]]]])
         pieces = np.concatenate([piece, *(block[p.piece] for p in pins), block[seat[free]]])
         splines = lattice.splines(places, pieces, matter.links.numpy(), len(matter.position), cell * size)
         if splines.count <= MOST_SPLINES:
@@ -163,7 +164,7 @@ def model(
     np.maximum.at(stiff, piece, modulus)
     permanent = sparse.csr_matrix((splines.count, splines.count))
     for p in pins:
-        S, _ = splines.at(p.position, block[p.piece])
+        S, _ = splines.at(p.position, block[p.piece], continued_from=centres[block[p.piece]])
         permanent = permanent + S.T @ sparse.diags(PIN * stiff[block[p.piece]] / size * p.area) @ S
     held = permanent.nnz > 0
     springs = [Spring(matrix=permanent)] if held else []
@@ -182,7 +183,7 @@ def model(
     first_moment = N.T @ (world.density * weight)
 
     span = float(np.linalg.norm(np.ptp(at, axis=0)))
-    values, slopes = _at_particles(splines, x.numpy(), np.where(seat >= 0, block[seat], -1))
+    values, slopes = _at_particles(splines, x.numpy(), np.where(seat >= 0, block[seat], -1), centres)
     rest = (permanent + sparse.diags(faint)).tocsr()
     shift = _shift(world, modulus, span, held)
     exact, shapes = vibration.modes((K + _three(rest)).tocsr(), M, modes + (0 if held else 6), shift=shift)
@@ -295,9 +296,10 @@ def _seats(x: np.ndarray, matter: Matter) -> np.ndarray:
     return seat
 
 
-def _at_particles(splines: lattice.Splines, x: np.ndarray, seat: np.ndarray):
-    """Values [p, count] and gradients [3 p, count] at the particles, zero where they are held."""
+def _at_particles(splines: lattice.Splines, x: np.ndarray, seat: np.ndarray, centres: np.ndarray):
+    """Values [p, count] and gradients [3 p, count] at the particles, zero where they are held; `seat` [p] is the piece
+    that each sits on, and `centres` [m, 3] m those of the pieces."""
     free = np.flatnonzero(seat >= 0)
-    N, G = splines.at(x[free], seat[free])
+    N, G = splines.at(x[free], seat[free], continued_from=centres[seat[free]])
     spread = sparse.csr_matrix((np.ones(len(free)), (free, np.arange(len(free)))), shape=(len(x), len(free)))
     return (spread @ N).tocsr(), (sparse.kron(spread, sparse.identity(3), format="csr") @ G).tocsr()

@@ -43,6 +43,19 @@ def test_a_body_is_as_large_as_its_pictures_wherever_its_gaussians_lie(depth, fl
     assert (volume * 3 / (4 * np.pi)) ** (1 / 3) == pytest.approx(truth, abs=1.2e-3)
 
 
+def test_fewer_particles_fill_the_same_body():
+    """... of the same stiffness in bending: the second moment of what a cell holds is known."""
+    gaussians, cameras, truth = seen_around(*PLAIN)
+    for spacing in (SPACING, 2 * SPACING):
+        body = filled(gaussians, cameras, spacing=spacing)
+        assert len(body.position) < 1.3 * 4 / 3 * np.pi * (truth / spacing) ** 3  # shells of cells that are cut
+        x, volume, moment = (a.numpy() for a in (body.matter.position, body.matter.volume, body.matter.moment))
+        square = (volume[:, None] * (x**2 + moment[:, [0, 1, 2], [0, 1, 2]])).sum(0)
+        radius = np.sqrt(5 * square / volume.sum())  # of a ball: int x^2 dV = V R^2 / 5
+        np.testing.assert_allclose(radius, truth, atol=1.2e-3)  # three quarters of a pixel, as above
+    assert volume.sum() == pytest.approx(volume_of(*PLAIN), rel=0.03)
+
+
 def test_what_is_filled_is_what_lies_inside_the_surface_seen(rng):
     """... and not within a spacing inside it, where the centres lie."""
     point, normal = sphere(6000, RADIUS, rng)
