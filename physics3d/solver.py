@@ -8,7 +8,7 @@ Both answer with the same Trajectory and are differentiable in the parameters, t
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -52,6 +52,17 @@ class Motion:
             if motion is not None:
                 return motion
         return grid.rollout(self.world, parameters, self.position, self.volume, excitation=self.excitation, **timing)
+
+    def settled(self, parameters: Values, *, velocity: Tensor | None, frames: int, frame_dt: float) -> "Motion":
+        """Itself, or the body moved by the grid alone where the modes do not serve with these parameters: trials that
+        one solver moves and then the other have steps in their loss, and cost the time of both."""
+        if self.modes is None or self.world.solver == "modes":
+            return self
+        timing: dict[str, Any] = dict(
+            velocity=velocity, frames=frames, frame_dt=frame_dt, device=self.device, log=Log(None)
+        )
+        with torch.no_grad():
+            return self if self._by_modes(parameters, timing) is not None else replace(self, modes=None)
 
     def report(self, parameters: Values) -> None:
         """Say how the body vibrates with these parameters, if it is moved by its modes."""

@@ -16,7 +16,7 @@ def sheet(point: np.ndarray, normal: np.ndarray, spacing: float, detail: float) 
     tree = cKDTree(point)
     radius = APART / 2 * spacing
     free, chosen = np.ones(len(point), bool), []
-    for i in range(len(point)):
+    for i in np.random.default_rng(0).permutation(len(point)):  # in the order of their places they would lie denser
         if free[i]:
             chosen.append(i)
             free[tree.query_ball_point(point[i], radius)] = False

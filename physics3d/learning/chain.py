@@ -69,11 +69,13 @@ def chain_of(
         device=device,
         log=log,
     )
-    motion.report(part(field.parameters(field.zero())))
+    timing = dict(frames=at[-1] + 1, frame_dt=step / take.fps)
+    first = part(field.parameters(field.zero()))
+    motion = motion.settled(first, velocity=field.velocity(field.zero()), **timing)
+    motion.report(first)
 
     def simulate(theta: Tensor):
-        timing = dict(frames=at[-1] + 1, frame_dt=step / take.fps, log=Log(None))
-        return motion(part(field.parameters(theta)), velocity=field.velocity(theta), **timing)
+        return motion(part(field.parameters(theta)), velocity=field.velocity(theta), log=Log(None), **timing)
 
     def pushed(theta: Tensor, more: float):
         stronger = replace(
@@ -83,8 +85,7 @@ def chain_of(
             modes=None if motion.modes is None else motion.modes.pushed(math.exp(more)),
             log=Log(None),
         )
-        timing = dict(frames=at[-1] + 1, frame_dt=step / take.fps, log=Log(None))
-        return stronger(part(field.parameters(theta)), velocity=field.velocity(theta), **timing)
+        return stronger(part(field.parameters(theta)), velocity=field.velocity(theta), log=Log(None), **timing)
 
     def render(motion, view: int, frames: Tensor) -> Tensor:
         draw = lambda x, F: (

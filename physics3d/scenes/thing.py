@@ -64,7 +64,6 @@ class ThingSource(AbstractSource):
         require_fields(self, "source")
         self.files()  # what is missing is said before clips are read
         around, clips = self._around(), clip_files(self._clips())
-        _require_unlike(clips)
         takes = filmed_takes(self._clips(), log=log, fps=self.fps)
         with tempfile.TemporaryDirectory(prefix="physics3d_") as work:
             images = Path(work) / "images"
@@ -155,14 +154,6 @@ class ThingSource(AbstractSource):
             name = f"{number:03d}.png"
             Image.fromarray(piece[min(take.rest - first, len(piece) - 1)].numpy()).save(target / name)
             yield f"{target.name}/{name}", clip.name
-
-
-def _require_unlike(clips: list[Path]) -> None:
-    """Takes are called as their files without the ending."""
-    stems = [clip.stem for clip in clips]
-    for clip in clips:
-        if stems.count(clip.stem) > 1:
-            raise ValueError(f"two clips are called {clip.stem}, but for their endings; rename one")
 
 
 def _seen(take: FilmedTake, posed: Posed, axes: Axes, fit: Fit, log, *, number: int, clip: str) -> Take:

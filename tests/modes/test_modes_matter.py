@@ -9,6 +9,7 @@ from modes_bodies import turned_beam
 
 from physics3d.filling.cells import solid_cells
 from physics3d.matter import Matter, in_blocks, of_particles, points
+from physics3d.modes import lattice
 
 THICK, LONG = 0.012, 0.24  # of a square bar [m]
 
@@ -92,3 +93,22 @@ def test_a_gap_narrower_than_a_cell_stays_a_gap(shift, wide):
     links = matter.links.numpy()
     assert len(links) and (upper[links[:, 0]] == upper[links[:, 1]]).all()
     assert matter.volume.sum() == pytest.approx(2 * thick * wide**2, rel=0.1)
+
+
+def test_what_holds_a_body_asks_only_functions_that_hold_matter():
+    """Wherever a face lies among the knots: one just before a knot lies in a cell without a point of the body."""
+    edge, count = 0.004, 6
+    x = (torch.arange(count, dtype=torch.float64) + 0.5) * edge
+    body = of_particles(torch.stack([x, 0 * x, 0 * x], 1), torch.full((count,), edge**3, dtype=torch.float64))
+    at, weight, piece = points(body)
+    centre = body.position.numpy()
+    face = np.array([[0.0, y, z] for y in (-1, 1) for z in (-1, 1)]) * edge / np.sqrt(12)  # its left end
+    for H in np.linspace(1.2, 2.4, 25) * edge:  # knots are everywhere between the end and the first points
+        places, which = np.concatenate([at, centre[:1]]), np.append(piece, 0)
+        splines = lattice.splines(places, which, body.links.numpy(), count, H)
+        values, _ = splines.at(face, np.zeros(4, int), continued_from=np.repeat(centre[:1], 4, 0))
+        held = splines.at(at, piece)[0].T @ weight
+        assert (held[np.unique(values.nonzero()[1])] > 0).all()
+        # and what is continued is the field itself, if that is affine
+        expected = np.concatenate([np.ones((4, 1)), face], 1)
+        np.testing.assert_allclose(values @ splines.affine(), expected, rtol=0, atol=1e-12)

@@ -72,6 +72,10 @@ def test_a_body_that_comes_to_touch_a_wall_is_moved_by_the_grid_and_this_is_said
         found = motion(PARAMETERS, frames=4, frame_dt=0.02, log=Log(None))
     by_grid = rollout(near, PARAMETERS, position, volume, frames=4, frame_dt=0.02, device="cpu", log=Log(None))
     assert torch.equal(found.position, by_grid.position)
+    timing = dict(velocity=None, frames=4, frame_dt=0.02)
+    assert motion.settled(PARAMETERS, **timing).modes is None
+    stiff = PARAMETERS | {"youngs_modulus": torch.tensor(1e7)}  # it sags by a thousandth of that
+    assert motion.settled(stiff, **timing) is motion
     warned = [line for line in lines(tmp_path) if "the grid takes over" in line]
     assert len(warned) == 1 and "reaches the HalfSpace in frame" in warned[0]
 

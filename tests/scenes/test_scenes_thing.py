@@ -174,7 +174,7 @@ WRONG = {
     "an empty folder of clips": (emptied, "clips holds no clip"),
     "two clips of one name": (
         lambda folder: shutil.copy(folder / "clips" / "a.mp4", folder / "clips" / "a.mov"),
-        "two clips are called a, ",
+        "whose takes would have one name",
     ),
     "clips beside the photographs": (
         lambda folder: shutil.copy(folder / "clips" / "a.mp4", folder / "poke.mp4"),
