@@ -59,7 +59,12 @@ class Round(AbstractSolid):
 
 
 def filled(
-    gaussians: Gaussians, cameras: list[Camera], label=None, solid: AbstractSolid = Poisson(), spacing: float = SPACING
+    gaussians: Gaussians,
+    cameras: list[Camera],
+    label=None,
+    solid: AbstractSolid = Poisson(),
+    spacing: float = SPACING,
+    thickness: float | None = None,
 ):
     return fill(
         gaussians,
@@ -68,7 +73,7 @@ def filled(
         opacity=0.1,
         solid=solid,
         interior=True,
-        sheet_thickness=None,
+        sheet_thickness=thickness,
         isolated="keep",
         drop_pieces_below=0.0,
         attach=False,

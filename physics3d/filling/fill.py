@@ -78,11 +78,11 @@ def fill(
     moving = gaussians.select(which)
     reliable, opacity = showing(moving, opacity, log)
     shown = moving.select(reliable)
-    detail = _detail(shown, spacing)
+    detail = _detail(shown, spacing, seen=len(cameras) > 0)
     static = gaussians.select((label == 0) & (gaussians.opacity > opacity))
 
     view, below = _look(gaussians, label, shown, cameras, spacing=detail, opacity=opacity, log=log)
-    surface, deviation = sample_surface(shown, detail, beside=static, view=view, below=below, log=log)
+    surface, deviation = sample_surface(shown, spacing, detail=detail, beside=static, view=view, below=below, log=log)
     inside = _bounded(solid.inside(surface, detail), view, below, detail)
     position, volume, matter = solid_cells(inside, surface.point, spacing)
     inner = cKDTree(surface.point).query(position)[0] > spacing if len(position) else np.zeros(0, bool)
@@ -167,9 +167,9 @@ def showing(moving: Gaussians, opacity: float, log: Log) -> tuple[Int[Tensor, " 
     return reliable, opacity
 
 
-def _detail(shown: Gaussians, spacing: float) -> float:
-    """The scale [m] at which the surface is looked at: that of the particles, but no coarser than the body needs, nor
-    finer than its Gaussians tell.
+def _detail(shown: Gaussians, spacing: float, *, seen: bool) -> float:
+    """The scale [m] at which the surface is looked at: that of the particles. Where cameras see it, it is no coarser
+    than the body needs, and no finer than its Gaussians tell; by itself, what is thin shows at a coarse scale only.
 
     Raises ValueError if the body is too small or too large for the particles."""
     size = np.ptp(shown.mean.double().numpy(), 0)
@@ -183,6 +183,8 @@ def _detail(shown: Gaussians, spacing: float) -> float:
             f"fill.spacing = {spacing:g} m cuts a body of {size.max():.3g} m into more than {MOST_CELLS} cells; "
             f"take at least {size.max() / MOST_CELLS:.2g} m, or correct the segmentation"
         )
+    if not seen:
+        return spacing
     thickness = 2 * float(torch.exp(shown.log_scale.amin(1)).median())
     return min(spacing, max(float(size.max()) / DETAIL, thickness))
 

@@ -16,7 +16,8 @@ def sheet(point: np.ndarray, normal: np.ndarray, spacing: float, detail: float) 
     tree = cKDTree(point)
     radius = APART / 2 * spacing
     free, chosen = np.ones(len(point), bool), []
-    for i in np.random.default_rng(0).permutation(len(point)):  # in the order of their places they would lie denser
+    # the first of every voxel of half a spacing: among denser ones, in this order, they would lie closer to each other
+    for i in np.unique(np.floor(point / (spacing / 2)).astype(np.int64), axis=0, return_index=True)[1]:
         if free[i]:
             chosen.append(i)
             free[tree.query_ball_point(point[i], radius)] = False

@@ -45,18 +45,21 @@ def sample_surface(
     gaussians: Gaussians,
     spacing: float,
     *,
+    detail: float | None = None,
     beside: Gaussians | None = None,
     view: Seen | None = None,
     below: Ground | None = None,
     log: Log = Log(None),
 ) -> tuple[Surface, np.ndarray]:
-    """Samples about half a spacing apart, and the least deviation [m] of the Gaussians at each.
+    """Samples about half of `detail` [m] apart, and the least deviation [m] of the Gaussians at each.
 
+    None is `spacing` [m], that of the particles: whatever the detail, it says what is thin and what is enclosed.
     `beside` are Gaussians that do not belong to the body but hide the sky: what it stands on or leans against. `view`
     is what cameras see: samples of solid parts are moved onto its surface, those not near it are inside and left out;
     `below` closes it where it stands or leans.
     """
-    step = spacing / 2
+    detail = spacing if detail is None else detail
+    step = detail / 2
     point, owner = over_discs(gaussians, step)
     gap = np.quantile(cKDTree(point).query(point, k=2)[0][:, 1], 0.95)
     h = max(0.75 * spacing, 1.5 * gap)
@@ -76,11 +79,11 @@ def sample_surface(
         return Surface(point + outward, normal, enclosure, thin=thin, hidden=hidden), deviation
 
     solid = ~thin & ~hidden
-    point, normal, found = _settled(point, normal, deviation, solid, view, spacing, log)
+    point, normal, found = _settled(point, normal, deviation, solid, view, detail, log)
     hidden = hidden | (solid & ~found)
     if below is not None:
-        end, downwards = _ends_below(view, below, spacing)
-        side, outwards = _sides_below(point[solid & found], normal[solid & found], view, below, spacing)
+        end, downwards = _ends_below(view, below, detail)
+        side, outwards = _sides_below(point[solid & found], normal[solid & found], view, below, detail)
         point, normal = np.concatenate([point, end, side]), np.concatenate([normal, downwards, outwards])
         none = np.zeros(len(end) + len(side))
         thin, hidden = (np.concatenate([a, none > 0]) for a in (thin, hidden))

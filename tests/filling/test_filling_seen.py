@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from analytic_bodies import box, discs, joined, sphere
+from analytic_bodies import box, discs, joined, petal, sphere
 from seen_bodies import RADIUS, SPACING, Round, around, ball, filled, radius_in_pictures
 
 from physics3d.filling.seen import seen
@@ -135,6 +135,15 @@ def test_a_sheet_of_broad_gaussians_has_its_area(breadth, seen_by, rng):
     least, most = 0.85 * sides.prod() / SPACING**2, 1.1 * (sides + 2 * sigma).prod() / SPACING**2
     assert least < len(body.position) < most
     assert float(body.position[:, 2].abs().max()) < 1e-3
+
+
+def test_a_bent_petal_stays_thin_however_closely_it_is_looked_at(rng):
+    """With cameras it is looked at twice as closely as its particles lie; its sides are as far apart as before."""
+    (point, normal), area = petal(6000, rng)
+    gaussians = discs(point - point.mean(0), normal, rng, thickness=0.0003)
+    body = filled(gaussians, around(16), thickness=0.001)
+    # a solid of so many Gaussians would be several millimetres thick
+    assert float(body.volume.double().sum()) == pytest.approx(0.001 * area, rel=0.1)
 
 
 @pytest.mark.parametrize("breadth", BREADTHS)
