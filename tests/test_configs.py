@@ -85,6 +85,17 @@ def test_a_method_is_kept_whatever_the_profile(method):
         assert config["material"]["model"] == plain["material"]["model"]
 
 
+@pytest.mark.parametrize("scene", ["photos", "llff", "thing", "clip", "carnation_real", "telephone_real"])
+def test_a_thing_that_nobody_has_measured_is_pushed_whatever_it_weighs_and_held_where_it_is(scene):
+    """Where its floor is and what it weighs nobody knows: no region stands still, and no force is given."""
+    config, _ = compose([f"scene={scene}"])
+    simulate = build(config["simulate"], "cpu", "simulate")
+    assert simulate.world.boundaries == ()
+    (push,) = simulate.excitation
+    assert push.force is None and max(map(abs, push.acceleration_of_each)) > 1.0
+    assert simulate.force is None
+
+
 def test_every_file_says_what_it_is():
     """The first comment is what --help shows."""
     for path in sorted(CONF.rglob("*.yaml")):
