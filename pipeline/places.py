@@ -7,6 +7,7 @@ import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from pipeline.filed import vacant
 from pipeline.settings import SettingsError
 
 LONGEST = 200  # of a name [byte]: file systems allow 255, of which hidden names beside it need some
@@ -28,8 +29,7 @@ def new_place(environment: Mapping[str, str], ending: str = "") -> Path | None:
         return None
     if ending and path.suffix.lower() != ending:
         raise SettingsError(f"OUT={environment['OUT']} names no {ending} file; say OUT=<name>{ending}")
-    if os.path.lexists(path):
-        raise FileExistsError(f"{path} is there already; remove it, or say OUT=<another place>")
+    vacant(path)
     _require_room(path, path.absolute().parents)
     return path
 

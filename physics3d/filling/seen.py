@@ -13,7 +13,7 @@ Outlines exclude: the distance is the largest but for a tenth of the cameras, so
 nothing. Depths are uncertain: the distance is their mean, cut off at the truncation t (Curless and Levoy 1996). The
 larger of the two holds. What no camera sees keeps -t. Both are measured along rays, which meet the outside more
 obliquely than the inside: before they are smoothed they are divided by their slope, for else the steeper side would
-move the surface inwards, that of a stem of 24 mm by 0.35.
+move the surface inwards, that of a stem 24 mm thick by 0.35 mm.
 """
 
 from collections.abc import Sequence

@@ -140,7 +140,7 @@ def test_a_sheet_of_broad_gaussians_has_its_area(breadth, seen_by, rng):
 def test_a_bent_petal_stays_thin_however_closely_it_is_looked_at(rng):
     """With cameras it is looked at twice as closely as its particles lie; its sides are as far apart as before."""
     (point, normal), area = petal(6000, rng)
-    gaussians = discs(point - point.mean(0), normal, rng, thickness=0.0003)
+    gaussians = discs(point - point.mean(0), normal, rng, noise=0.0003)
     body = filled(gaussians, around(16), thickness=0.001)
     # a solid of so many Gaussians would be several millimetres thick
     assert float(body.volume.double().sum()) == pytest.approx(0.001 * area, rel=0.1)
