@@ -29,6 +29,7 @@ from physics3d.materials.neo_hookean import NeoHookean
 from physics3d.materials.newtonian import Newtonian
 from physics3d.materials.viscoelastic import Viscoelastic
 from physics3d.materials.von_mises import VonMises
+from physics3d.modes import rollout as modes
 from physics3d.mpm.rollout import rollout
 from physics3d.trajectory import Trajectory
 from physics3d.warp_types import matrix, vector
@@ -56,11 +57,12 @@ def block(cells: tuple[int, int, int], dx: float, lower=(0.0, 0.0, 0.0)) -> tupl
 
 
 def simulate(world: World, position: Tensor, volume: Tensor, *, parameters=None, **more) -> Trajectory:
-    """A rollout on one thread without gradients."""
+    """A rollout on one thread without gradients, without a grid where world.solver says so."""
     if parameters is None:
         parameters = {name: torch.tensor(value, dtype=torch.float64) for name, value in world.start.items()}
+    one = modes.rollout if world.solver == "modes" else rollout
     with torch.no_grad():
-        return rollout(world, parameters, position, volume, threads=1, log=Log(None), **more)
+        return one(world, parameters, position, volume, threads=1, log=Log(None), **more)
 
 
 def relative(measured: Tensor, exact: Tensor) -> float:

@@ -4,13 +4,16 @@
 
 The problems are in benchmarks/known_answers.py, each with its equation and source; `cells` is the number of grid cells
 along the length that matters. Explicit runs take automatic substeps (cfl), implicit ones a fixed multiple of the
-explicit limit where waves are what limits it. The error is the relative error of what the problem is about; for the
-shear start-up, which has no grid, that of the final tau_12 and N1. The time is wall clock on one thread, kernels
-compiled before: the median of three runs, or one run where that takes over two seconds. A run with a fixed substep
-beyond the stable limit must be refused.
+explicit limit where waves are what limits it. `modes` is the solver without a grid, by its automatic steps, with the
+building of its model in the time: of a cantilever of the same particles, and of the viscoelastic bar without Poisson's
+ratio (tests/modes/modes_bodies.py), which needs no walls; its cells are pieces along the bar. The error is the relative
+error of what the problem is about; for the shear start-up, which has no grid, that of the final tau_12 and N1. The time
+is wall clock on one thread, kernels compiled before: the median of three runs, or one run where that takes over two
+seconds. A run with a fixed substep beyond the stable limit must be refused.
 """
 
 import csv
+import functools
 import math
 import statistics
 import sys
@@ -19,6 +22,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "modes"))
+import modes_bodies
 from known_answers import K_N, M_E, MU_N, PROBLEMS, Answer
 from machine import machine
 
@@ -46,6 +52,7 @@ CELLS = {
     "Poiseuille": (8, 16, 32),
 }
 EXPLICIT = {"cfl 0.5": dict(cfl=0.5, scheme="explicit"), "cfl 0.2": dict(cfl=0.2, scheme="explicit")}
+MODES = {"viscoelastic bar": (4, 8, 16, 32), "cantilever": (1, 2, 4)}
 # problem -> wave speed [m/s] and length [m] of the cells, for substeps in units of dx/c
 C_BAR, C_VISCOUS = math.sqrt(M_E / 1000.0), math.sqrt((M_E + K_N + 4 / 3 * MU_N) / 1000.0)
 WAVES = {
@@ -76,6 +83,9 @@ def main(words: list[str]) -> None:
                     if cells == CELLS[problem][0]:
                         attempt(run)  # compiles
                     rows.append(measure(run, problem=problem, precision=precision, size=f"{cells} cells", step=step))
+            for cells in MODES.get(problem, ()):
+                run = functools.partial(without_grid, problem, cells, precision)
+                rows.append(measure(run, problem=problem, precision=precision, size=f"{cells} cells", step="modes"))
     if "shear start-up" in chosen:
         for precision in PRECISIONS:
             start_up(8, precision)
@@ -133,6 +143,14 @@ def measure(run: Callable[[], Answer], **row) -> dict:
         row |= dict(error=answer.error, seconds=statistics.median(times))
     print({k: v for k, v in row.items() if v}, flush=True)
     return row
+
+
+def without_grid(problem: str, cells: int, precision: str) -> Answer:
+    """By the modes."""
+    if problem == "cantilever":
+        return PROBLEMS[problem](cells, solver="modes", precision=precision)
+    error, steps = modes_bodies.viscoelastic_bar(cells, precision)
+    return Answer(error=error, substeps=steps, more={})
 
 
 def start_up(steps: int, precision: str) -> Answer:

@@ -1,6 +1,7 @@
 """Stiff and extreme cases: where the simulator is right, where it refuses, and that it never ends in NaN.
 
-    make bench-stability [ARGS="seed=0"]   ->   docs/results/stability.csv, stability_extremes.csv, .png, .md
+    make bench-stability [ARGS="seed=0"]   ->   docs/results/stability.md, .csv, .png, stability_extremes.csv,
+                                                stability_modes.csv, stability_modes_extremes.csv, stability_modes.png
 
 Map. A free bar of 16 cells between lateral slip walls, 128 particles, fixed corotated, nu = 0.4, in its first axial
 vibration, v = 0.05 m/s at its ends. Young's modulus against a fixed substep, 48 substeps and more, 16 implicit ones (dt
@@ -30,6 +31,9 @@ from pathlib import Path
 import numpy as np
 import torch
 import warp as wp
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "modes"))
+import stability_modes
 from machine import machine
 
 from physics3d.boundaries.bounding_box import BoundingBox
@@ -72,7 +76,7 @@ def main(words: list[str]) -> None:
     signal.signal(signal.SIGPROF, _hang)
     cells = [cell for young in YOUNG for dt in DT for cell in map_cells(young, dt)]
     extremes = [row for case in cases(seed) for row in extreme(*case)]
-    write(cells, extremes, seed)
+    write(cells, extremes, stability_modes.maps(), stability_modes.extremes(), seed)
 
 
 def _hang(*_: object) -> None:
@@ -476,17 +480,20 @@ def extreme_run(
 # --- results ----------------------------------------------------------------------------------------------------------
 
 
-def write(cells: list[dict], extremes: list[dict], seed: int) -> None:
+def write(cells: list[dict], extremes: list[dict], modes: list[dict], modes_extremes: list[dict], seed: int) -> None:
     RESULTS.mkdir(parents=True, exist_ok=True)
     title = f"{machine('cpu')}, numpy {np.__version__}, 1 thread, seed {seed}"
-    for name, rows in (("stability", cells), ("stability_extremes", extremes)):
+    tables = dict(stability=cells, stability_extremes=extremes, stability_modes=modes)
+    for name, rows in (tables | dict(stability_modes_extremes=modes_extremes)).items():
         with (RESULTS / f"{name}.csv").open("w", newline="") as file:
             file.write(f"# {title}\n")
             table = csv.DictWriter(file, rows[0])
             table.writeheader()
             table.writerows(r | {"detail": shortened(r["detail"])} for r in rows)
     draw(cells, title)
-    (RESULTS / "stability.md").write_text(page(cells, extremes, title))
+    stability_modes.draw(modes, COLORS, RESULTS / "stability_modes.png", title)
+    without_grid = stability_modes.section(modes, modes_extremes, "stability_modes.png")
+    (RESULTS / "stability.md").write_text(page(cells, extremes, title) + "\n" + "\n".join(without_grid))
 
 
 def draw(cells: list[dict], title: str) -> None:

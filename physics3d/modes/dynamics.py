@@ -25,7 +25,7 @@ from jaxtyping import Float
 from scipy import linalg, sparse
 
 from physics3d.modes.stress import Points
-from physics3d.modes.vibration import stiffness
+from physics3d.modes.vibration import STUCK, stiffness
 
 # of the last correction, of the largest first one of the run, in the norm of the matrix; by the precision asked for
 TOLERANCE = {torch.float32: 1e-6, torch.float64: 1e-11}
@@ -33,6 +33,10 @@ ROUND_OFF = 1e-7  # the same, where no step is better
 MOST_ITERATIONS = 60
 SLOW = 0.5  # an error that falls by less asks for a new matrix
 SHORTEST = 1e-3  # share of a Newton step
+LINEAR = 1e-6  # deformation in which the second order is lost
+# of the largest energy so far, which a motion may gain beyond the work of the loads: what is less comes and goes with
+# the phase of a large swing, or with the length of a step
+GAIN = 0.1
 
 
 class NotSolved(ValueError):
@@ -118,34 +122,77 @@ class System:
     iterations: int = 0  # of Newton so far
     matrices: int = 0  # factored so far
     scale: float = 0.0  # of the corrections
+    peak: float = 0.0  # the largest energy so far [J]
+    least: float = 0.0  # energy so far less the work of the loads, at its least: losses lower it [J]
+    _work: float = 0.0  # of the loads and of the springs that pull, so far [J]
+    _work_at: float = 0.0  # the same at the last midpoint
     _matrix: _Matrix | None = field(default=None, repr=False)
     _matrix_of: tuple = ()
     _K: object = field(default=None, repr=False)
-    _past: list[tuple[float, np.ndarray]] = field(default_factory=list, repr=False)  # the last midpoints
+    # dt, x and w of the last midpoints
+    _past: list[tuple[float, np.ndarray, np.ndarray]] = field(default_factory=list, repr=False)
 
     def __post_init__(self):
         self._back = self.gradient.T.copy()
 
     def run(
-        self, q: np.ndarray, v: np.ndarray, loads: np.ndarray, plan: Sequence[Step], keep: list | None
+        self,
+        q: np.ndarray,
+        v: np.ndarray,
+        loads: np.ndarray,
+        plan: Sequence[Step],
+        keep: list | None,
+        gain: float | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """(q, v) [r, 3] after the steps of the plan, under loads [b, r, 3] N. With `keep`, a list, what
-        the reverse pass needs is put there. Raises NotSolved; the state is then that of the start."""
-        begin = self.points.state(), self.since
+        """(q, v) [r, 3] after the steps of the plan, under loads [b, r, 3] N. With `keep`, a list, what the reverse
+        pass needs is put there. `gain`: share of the largest energy so far that may be gained from nowhere; None: it
+        is not looked at. Raises NotSolved; the state is then that of the start."""
+        begin = self.points.state(), self.since, self._work
+        if self.peak == 0:
+            self.least = self.peak = 0.5 * float(np.vdot(v, self.mass @ v)) + self.stored(q)
         try:
             for step in plan:
                 q, v = self._step(q, v, loads, step, keep)
+            if gain is not None:
+                self._balance(gain)
         except NotSolved:
             self.points.set_state(begin[0])
-            self.since = begin[1]
+            self.since, self._work = begin[1:]
             self._past = []
             raise
         return q, v
+
+    def _balance(self, gain: float) -> None:
+        """Of energy, at the last midpoint: there history and deformation belong together. Raises NotSolved."""
+        _, x, w = self._past[-1]
+        energy = 0.5 * float(np.vdot(w, self.mass @ w)) + self.stored(x)
+        surplus, peak = energy - self._work_at, max(self.peak, energy)
+        gained = (surplus - self.least) / max(peak, 1e-300)
+        if gained > gain:
+            raise NotSolved(f"the motion gains {100 * gained:.2g} % of its energy from nowhere")
+        self.least, self.peak = min(self.least, surplus), peak
+
+    def stored(self, x: np.ndarray) -> float:
+        """Elastic energy [J] of the body and of the springs that hold it at rest, with the present history."""
+        springs = sum(float(np.vdot(x, s.matrix @ x)) for s in self.springs if s.pull is None)
+        return self.points.energy((self.gradient @ x).reshape(-1, 3, 3)) + 0.5 * springs
 
     def force(self, x: np.ndarray, after: float) -> np.ndarray:
         """f(x) [r, 3]."""
         P = self.points.stress((self.gradient @ x).reshape(-1, 3, 3), after)
         return self._back @ P.reshape(-1, 3)
+
+    def quotient(self, shape: np.ndarray) -> float:
+        """Rayleigh's quotient omega^2 [1/s^2] of a shape [r, 3] of unit mass about the undeformed state, all dash-pots
+        stuck. The state is as it was."""
+        H = (self.gradient @ shape).reshape(-1, 3, 3)
+        small = LINEAR / max(float(np.abs(H).max()), 1e-300)
+        state = self.points.state()
+        self.points.set_state((np.zeros_like(state[0]), state[1]))
+        P = self.points.stress(small * H, STUCK)
+        self.points.set_state(state)
+        springs = sum(float(np.vdot(shape, s.matrix @ shape)) for s in self.springs if s.pull is None)
+        return float(np.vdot(H, P)) / small + springs
 
     def statics(self, x: np.ndarray, load: np.ndarray, time: float = 1e12) -> np.ndarray:
         """Equilibrium under a load [r, 3] N after a long time, in as many steps of the load as it takes.
@@ -192,7 +239,10 @@ class System:
         except NotSolved:  # going straight on may stretch what in truth turns
             self._refresh(q, after, (inertial, self._held(q, t)[1]))
             x = self._solve(q, residual, inertial, after, t)
-        self._past = [*self._past[-2:], (dt, x)]
+        self._past = [*self._past[-2:], (dt, x, (x - q) * (2 / dt))]
+        outer = sum((s.pull(t) - s.matrix @ x for s in self.springs if s.pull and t < s.until), load)
+        half = float(np.vdot(outer, x - q)) if len(loads) or self.springs else 0.0
+        self._work_at, self._work = self._work + half, self._work + 2 * half
         if keep is not None and before is not None:
             keep.append(_Taken(step, after, x, before, self._factored))
         self.points.keep()
@@ -201,8 +251,8 @@ class System:
 
     def _guess(self, q: np.ndarray, v: np.ndarray, dt: float) -> np.ndarray:
         """The coming midpoint: on the parabola through the last three, for what turns does not go straight on."""
-        if len(self._past) == 3 and all(old == dt for old, _ in self._past):
-            (_, a), (_, b), (_, c) = self._past
+        if len(self._past) == 3 and all(old[0] == dt for old in self._past):
+            a, b, c = (old[1] for old in self._past)
             return 3 * (c - b) + a
         return q + dt / 2 * v
 

@@ -4,9 +4,11 @@
     Solver(world, position, volume, ...).rollout(parameters, ...)       the same, the model of the body built once
 
 Time step. Errors of the midpoint rule in the frequency of a mode are (omega dt)^2/12. The automatic step is 1/STEPS of
-the period of the fastest mode that the loads and the start put a hundredth of the energy into, and at most a frame; all
-steps of a frame are equal. A frame that Newton cannot solve is done again with twice as many, up to TRIES times, then
-refused.
+the period of the fastest mode that the loads and the start put a hundredth of the energy into, and at most a frame;
+shorter, down to a fourth, where the motion would be more than a fiftieth of a period late at its end; and halved for
+every octave that the present material is above the one that the basis was made for. A step that is too long for this,
+the user's own or not, is warned about. All steps of a frame are equal. A frame that Newton cannot solve is done again
+with twice as many, up to TRIES times, then refused.
 
 Gradients. The exact adjoint of the discrete motion in the basis, with respect to parameters, velocity and the forces of
 boundaries; the basis and the places of the particles are given. What is kept of a step is its r x 3 amplitudes and the
@@ -27,7 +29,7 @@ from physics3d.log import Log
 from physics3d.materials.base import Values
 from physics3d.materials.mixture import PART
 from physics3d.matter import Matter
-from physics3d.modes.dynamics import NotSolved, Step, System
+from physics3d.modes.dynamics import GAIN, NotSolved, Step, System
 from physics3d.modes.model import MODES, QUADRATURE, Model, model
 from physics3d.modes.vibration import Mode
 from physics3d.trajectory import Trajectory
@@ -35,6 +37,9 @@ from physics3d.world import World
 
 STEPS = 24  # in a period of the fastest mode that matters
 SHARE = 0.01  # of the energy, from which on a mode matters
+LATE = 0.02  # of a period at the end, from which on steps are shorter than that
+MOST_FINER = 4  # times, in a frame
+FAR = 1.4  # stretched by more, a body is beyond what the basis was compared in
 TRIES = 6
 
 
@@ -233,6 +238,12 @@ class _Run:
             q, v, count = self._frame(frame, q, v, loads, count, keep)
             found.append(q)
             self._look(q, v, frame)
+        stretch = self.health["stretch_max"]
+        if max(stretch) > FAR:
+            self.log.warn(
+                f"the body is stretched by {max(stretch):.2g} in frame {int(np.argmax(stretch))}; the basis is made "
+                "for what bends and turns, and may be wrong there: compare with world.solver='grid'"
+            )
         return np.stack(found)
 
     def backward(self, q_bar: np.ndarray, loads: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -256,7 +267,7 @@ class _Run:
         for tried in range(1, TRIES + 1):
             taken: list | None = [] if keep else None
             try:
-                q_new, v_new = self.system.run(q, v, loads, self._plan(frame, count), taken)
+                q_new, v_new = self.system.run(q, v, loads, self._plan(frame, count), taken, GAIN)
                 break
             except NotSolved as reason:
                 if tried == TRIES or 2 * count > world.max_substeps or world.dt is not None:
@@ -279,33 +290,62 @@ class _Run:
         return plan
 
     def _count(self, v: np.ndarray, loads: np.ndarray) -> int:
-        """Steps in a frame."""
-        world, body = self.solver.world, self.solver.model
+        """Steps in a frame. Raises ValueError where they are more than the world allows."""
+        world, length = self.solver.world, self.frame_dt
+        share, then, now = self._swings(v, loads)
         if world.dt is not None:
-            return math.ceil(self.frame_dt / world.dt * (1 - 1e-9))
+            count = math.ceil(length / world.dt * (1 - 1e-9))
+        else:
+            # by whole octaves, so that a loss has no steps where a material changes a little
+            raised = then * 2 ** max(0, round(math.log2(now.max() / then.max()))) if len(then) else then
+            count = max(1, math.ceil(length * raised.max(initial=0.0) / (2 * math.pi) * STEPS))
+            late = self._late(share, raised, length / count)
+            count = math.ceil(count * min(max(math.sqrt(late / LATE), 1.0), MOST_FINER))
+        if count > world.max_substeps:
+            raise ValueError(
+                f"a frame would need {count} steps of {length / count:.3g} s, more than world.max_substeps = "
+                f"{world.max_substeps}; take a larger world.dt, shorter frames, or a larger max_substeps"
+            )
+        late = self._late(share, now, length / count)
+        if late > (3 * LATE if world.dt is None else LATE):  # of automatic steps octaves leave a factor of 2.8
+            better = min(length / count * math.sqrt(LATE / late), 2 * math.pi / float(now.max()) / STEPS)
+            self.log.warn(
+                f"by steps of {length / count:.2g} s the motion is {late:.2g} periods late at the end; take "
+                f"world.dt <= {better:.2g}{'' if world.dt is None else ', or None'}"
+            )
+        return count
+
+    def _swings(self, v: np.ndarray, loads: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of the modes that matter: share of the energy, omega [1/s] of the material that the basis was made for, and
+        of the present one."""
+        body = self.solver.model
         omega = np.maximum(body.omega, 1e-9)
         # energies that the modes would have: of a static response, and of the start
         energy = np.zeros(len(omega))
         for load in loads:
             energy = np.maximum(energy, _share(np.einsum("mrk,rk->m", body.shapes, load) ** 2 / omega**2, omega))
         energy = np.maximum(energy, _share(np.einsum("mrk,rk->m", body.shapes, body.mass @ v) ** 2, omega))
-        matters = energy > SHARE
-        if not matters.any():
-            return 1
-        fastest = float(omega[matters].max())
-        return max(1, math.ceil(self.frame_dt * fastest / (2 * math.pi) * STEPS))
+        matters = np.flatnonzero(energy > SHARE)
+        now = [math.sqrt(max(self.system.quotient(body.shapes[m]), 1e-18)) for m in matters]
+        return energy[matters] / max(energy[matters].sum(), 1e-300), omega[matters], np.array(now)
+
+    def _late(self, share: np.ndarray, omega: np.ndarray, dt: float) -> float:
+        """Periods that the motion lags behind at the end, in the mean over the energy: of the midpoint rule, which
+        swings at (2/dt) atan(omega dt/2)."""
+        half = omega * dt / 2
+        return float(share @ (omega / (2 * math.pi) * (1 - np.arctan(half) / half))) * self.frame_dt * (self.frames - 1)
 
     def _look(self, q: np.ndarray, v: np.ndarray, frame: int) -> None:
         """Velocity and health of a frame, by the names of the solver with a grid."""
         self.velocities.append(v)
-        world, body, points = self.solver.world, self.solver.model, self.system.points
+        world, body = self.solver.world, self.solver.model
         H = (body.gradient @ q).reshape(-1, 3, 3)
         F = H + np.eye(3)
         J = np.linalg.det(F)
         stretch = np.sqrt(np.linalg.eigvalsh(F @ F.transpose(0, 2, 1)).max(1))
         speed = np.linalg.norm(body.values @ v, axis=1)
         kinetic = 0.5 * float(np.vdot(v, body.mass @ v))
-        elastic = points.energy(H) + 0.5 * sum(float(np.vdot(q, s.matrix @ q)) for s in body.springs if s.pull is None)
+        elastic = self.system.stored(q)
         potential = -float(body.first_moment @ q @ np.array(world.gravity))
         momentum = body.first_moment @ v
         record = {
