@@ -148,8 +148,8 @@ class System:
         pass needs is put there. `gain`: share of the largest energy so far that may be gained from nowhere; None: it
         is not looked at. Raises NotSolved; the state is then that of the start."""
         begin = self.points.state(), self.since, self._work
-        if self.peak == 0:
-            self.least = self.peak = 0.5 * float(np.vdot(v, self.mass @ v)) + self.stored(q)
+        if gain is not None and self.peak == 0:
+            self.least = self.peak = self._energy(q, v)
         try:
             for step in plan:
                 q, v = self._step(q, v, loads, step, keep)
@@ -165,17 +165,22 @@ class System:
     def _balance(self, gain: float) -> None:
         """Of energy, at the last midpoint: there history and deformation belong together. Raises NotSolved."""
         _, x, w = self._past[-1]
-        energy = 0.5 * float(np.vdot(w, self.mass @ w)) + self.stored(x)
+        energy = self._energy(x, w)
         surplus, peak = energy - self._work_at, max(self.peak, energy)
         gained = (surplus - self.least) / max(peak, 1e-300)
         if gained > gain:
             raise NotSolved(f"the motion gains {100 * gained:.2g} % of its energy from nowhere")
         self.least, self.peak = min(self.least, surplus), peak
 
-    def stored(self, x: np.ndarray) -> float:
-        """Elastic energy [J] of the body and of the springs that hold it at rest, with the present history."""
-        springs = sum(float(np.vdot(x, s.matrix @ x)) for s in self.springs if s.pull is None)
-        return self.points.energy((self.gradient @ x).reshape(-1, 3, 3)) + 0.5 * springs
+    def _energy(self, x: np.ndarray, w: np.ndarray) -> float:
+        memory = self.points.data["memory"]
+        return 0.5 * float(np.vdot(w, self.mass @ w)) + float(self.stored(x[None], memory[None])[0])
+
+    def stored(self, x: Float[np.ndarray, "t r 3"], memory: Float[np.ndarray, "t m n"]) -> Float[np.ndarray, " t"]:
+        """Elastic energy [J] of the body and of the springs that hold it at rest, with its history."""
+        H = (self.gradient @ x).reshape(len(x), -1, 3, 3)
+        springs = [np.einsum("tri,rs,tsi->t", x, s.matrix, x) for s in self.springs if s.pull is None]
+        return self.points.energy(H, memory) + 0.5 * sum(springs, np.zeros(len(x)))
 
     def force(self, x: np.ndarray, after: float) -> np.ndarray:
         """f(x) [r, 3]."""

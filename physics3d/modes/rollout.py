@@ -176,7 +176,7 @@ class Solver:
         q = _Motion.apply(coefficients, start, loads, run)
         values, slopes = (torch.from_numpy(a) for a in (body.values, body.slopes))
         u = torch.stack([values @ a for a in q])
-        v = torch.stack([values @ torch.from_numpy(a) for a in run.velocities])
+        v = torch.stack([values @ torch.from_numpy(a) for _, a, *_ in run.seen])
         Ft = torch.stack([(slopes @ a).reshape(-1, 3, 3) for a in q])  # transposed
         rest = self.position.to(device=device, dtype=torch.float64)
         place = lambda a: a.to(device=device, dtype=self.world.dtype)
@@ -226,18 +226,20 @@ class _Run:
     counts: list[int] = field(default_factory=list)
     health: dict[str, list[float]] = field(default_factory=dict)
     taken: list[list] = field(default_factory=list)
-    velocities: list[np.ndarray] = field(default_factory=list)  # amplitudes [r, 3] of each frame [m/s]
+    # of each frame: amplitudes [r, 3] in m and m/s, history, iterations and matrices of Newton's method
+    seen: list[tuple[np.ndarray, np.ndarray, np.ndarray, int, int]] = field(default_factory=list)
 
     def forward(self, v: np.ndarray, loads: np.ndarray, keep: bool) -> np.ndarray:
         """Amplitudes [t, r, 3] of every frame."""
         q = np.zeros_like(v)
         found = [q]
-        self._look(q, v, 0)
+        self._look(q, v)
         count = self._count(v, loads)
         for frame in range(1, self.frames):
             q, v, count = self._frame(frame, q, v, loads, count, keep)
             found.append(q)
-            self._look(q, v, frame)
+            self._look(q, v)
+        self.health = {name: [float(value) for value in curve] for name, curve in self._record().items()}
         stretch = self.health["stretch_max"]
         if max(stretch) > FAR:
             self.log.warn(
@@ -335,40 +337,39 @@ class _Run:
         half = omega * dt / 2
         return float(share @ (omega / (2 * math.pi) * (1 - np.arctan(half) / half))) * self.frame_dt * (self.frames - 1)
 
-    def _look(self, q: np.ndarray, v: np.ndarray, frame: int) -> None:
-        """Velocity and health of a frame, by the names of the solver with a grid."""
-        self.velocities.append(v)
+    def _look(self, q: np.ndarray, v: np.ndarray) -> None:
+        """Keep what the record of a frame is made of."""
+        system = self.system
+        self.seen.append((q, v, system.points.data["memory"].copy(), system.iterations, system.matrices))
+        system.iterations = system.matrices = 0
+
+    def _record(self) -> dict[str, np.ndarray]:
+        """Health of all frames, by the names of the solver with a grid."""
         world, body = self.solver.world, self.solver.model
-        H = (body.gradient @ q).reshape(-1, 3, 3)
-        F = H + np.eye(3)
+        q, v, memory, iterations, matrices = (np.array(one) for one in zip(*self.seen, strict=True))
+        F = (body.gradient @ q).reshape(len(q), -1, 3, 3) + np.eye(3)
         J = np.linalg.det(F)
-        stretch = np.sqrt(np.linalg.eigvalsh(F @ F.transpose(0, 2, 1)).max(1))
-        speed = np.linalg.norm(body.values @ v, axis=1)
-        kinetic = 0.5 * float(np.vdot(v, body.mass @ v))
-        elastic = self.system.stored(q)
-        potential = -float(body.first_moment @ q @ np.array(world.gravity))
-        momentum = body.first_moment @ v
-        record = {
-            "speed_max": float(speed.max()),
-            "J_min": float(J.min()),
-            "J_max": float(J.max()),
-            "stretch_max": float(stretch.max()),
-            "inverted": float((J <= 0).sum()),
-            "isolated": 0.0,
+        stretch = np.sqrt(np.linalg.eigvalsh(F @ F.swapaxes(2, 3)).max((1, 2)))
+        kinetic = 0.5 * np.einsum("tri,rs,tsi->t", v, body.mass, v)
+        elastic = self.system.stored(q, memory)
+        potential = -np.einsum("r,tri,i->t", body.first_moment, q, np.array(world.gravity))
+        momentum = np.einsum("r,tri->it", body.first_moment, v)
+        return {
+            "speed_max": np.linalg.norm(body.values @ v, axis=2).max(1),
+            "J_min": J.min(1),
+            "J_max": J.max(1),
+            "stretch_max": stretch,
+            "inverted": (J <= 0).sum(1),
+            "isolated": np.zeros(len(q)),
             "kinetic_energy": kinetic,
             "elastic_energy": elastic,
             "potential_energy": potential,
             "energy": kinetic + elastic + potential,
-            "momentum_x": float(momentum[0]),
-            "momentum_y": float(momentum[1]),
-            "momentum_z": float(momentum[2]),
-            "substeps": float(self.counts[-1] if self.counts else 0),
-            "newton_iterations": float(self.system.iterations),
-            "matrices": float(self.system.matrices),
+            **{f"momentum_{axis}": one for axis, one in zip("xyz", momentum, strict=True)},
+            "substeps": np.array([0, *self.counts]),
+            "newton_iterations": iterations,
+            "matrices": matrices,
         }
-        self.system.iterations = self.system.matrices = 0
-        for name, value in record.items():
-            self.health.setdefault(name, []).append(value)
 
 
 class _Motion(torch.autograd.Function):

@@ -94,11 +94,13 @@ class Points:
             rows[k] = self.pull(unit, None, dt)["H"]
         return rows
 
-    def energy(self, Ht: Float[np.ndarray, "n 3 3"]) -> float:
-        """Stored elastic energy [J] of a deformation, with the present history."""
-        H = torch.from_numpy(np.ascontiguousarray(Ht)).mT
-        coefficients, memory = (torch.from_numpy(self.data[name]) for name in ("coefficients", "memory"))
-        return float(self.material.energy(coefficients, H, memory).numpy() @ self.data["weight"])
+    def energy(self, Ht: Float[np.ndarray, "t n 3 3"], memory: Float[np.ndarray, "t m n"]) -> Float[np.ndarray, " t"]:
+        """Stored elastic energy [J] of deformations, each with its history."""
+        times = len(Ht)
+        H = torch.from_numpy(np.ascontiguousarray(Ht)).reshape(-1, 3, 3).mT
+        of_each = torch.from_numpy(self.data["coefficients"]).repeat(1, times)
+        history = torch.from_numpy(np.ascontiguousarray(np.moveaxis(memory, 1, 0))).reshape(-1, times * self.n)
+        return self.material.energy(of_each, H, history).numpy().reshape(times, self.n) @ self.data["weight"]
 
     def _recorded(self, stage: int, dt: float, *, adjoint: bool = False) -> wp.Launch:
         kernel, inputs, outputs = self._kernels[stage]
