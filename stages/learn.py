@@ -36,6 +36,7 @@ from physics3d.learning.imagined import Imagined
 from physics3d.learning.interval import Beyond, Told, intervals, is_stiff, of_branches, posterior, told, words
 from physics3d.learning.linear import Shown, shown
 from physics3d.learning.loss import Chain
+from physics3d.learning.mirror import across, angular_frequency
 from physics3d.learning.polish import polish
 from physics3d.learning.rivals import widened
 from physics3d.learning.search import search
@@ -55,6 +56,7 @@ Span = Annotated[float, Gt(1), Le(1e12)]  # a factor
 Width = Annotated[float, Gt(0), Le(20)]
 USUAL_FRAMES = 15  # of a clip, for priors that take any number
 USUAL_STEPS = 15  # of gradient descent, where nothing is polished
+SAME = 0.05  # of theta: two ends of a polish that are one
 LOOKS = 2  # along the valley: a lower place is polished once, and looked around from again
 
 
@@ -185,6 +187,7 @@ class Learn:
             log.info("no polish: single losses of this prior and estimator cannot be compared")
         elif polished:
             theta, points = self.polished(chain, whole, theta, log)
+            theta, points = self.crossed(chain, whole, theta, points, log)
             course += points
         seen = shown(chain, whole, theta, seed=self.seed) if chain.certain else None
         said = self.said(whole, seen, log) if seen else None
@@ -216,12 +219,14 @@ class Learn:
                 said = self.said(finer, seen, log)
                 known = {name: [*known.get(name, []), *curve] for name, curve in history(finer, descent).items()}
         beyond = self.beyond.of(section, self.world.dx, on_grid=chain.on_grid)
+        with torch.no_grad():
+            omega = angular_frequency(chain.simulate(theta))
         learned = replace(
             start,
             parameters={name: v.detach().to(torch.float32) for name, v in field.parameters(theta).items()},
             velocity=field.velocity(theta).detach().to(torch.float32),
             history=known,
-            intervals=self.intervals(field, theta, seen, said, course, beyond, log) if seen and said else {},
+            intervals=self.intervals(field, theta, seen, said, course, beyond, omega, log) if seen and said else {},
         )
         self.report(capture, field, learned, seen, log)
         if log.folder is not None:
@@ -257,6 +262,26 @@ class Learn:
     def polished(self, chain: Chain, field: AbstractField, theta: Tensor, log: Log) -> tuple[Tensor, list[Point]]:
         """Where Levenberg's steps end, and their course."""
         return polish(chain, field, theta, steps=self.polish, stay=self.stay, seed=self.seed, log=log)
+
+    def crossed(
+        self, chain: Chain, field: GlobalField, theta: Tensor, points: list[Point], log: Log
+    ) -> tuple[Tensor, list[Point]]:
+        """The better one of theta, where a polish with these points ended, and the end of one that begins across from
+        it, in the other valley of the relaxation time; with both courses."""
+        with torch.no_grad():
+            places = across(field, theta, angular_frequency(chain.simulate(theta)))
+        if not places:
+            return theta, points
+        there = min(places, key=lambda place: chain.measure(place, self.seed))
+        time = lambda at: physical(field, at)["shear_relaxation_time"]
+        log.info(f"a relaxation time of {time(there):.3g} s damps the swing as {time(theta):.3g} s do: tried as well")
+        other, more = self.polished(chain, field, there, log)
+        ends = [Point(way="across", theta=at, loss=chain.measure(at, self.seed)) for at in (theta, other)]
+        if float((other - theta).abs().max()) < SAME:
+            return theta, points
+        worse, better = sorted(ends, key=lambda end: end.loss, reverse=True)
+        log.info(f"{time(better.theta):.3g} s explain the clip better: loss {better.loss:.5g}, not {worse.loss:.5g}")
+        return better.theta, [*points, *more, worse, replace(better, way="polish")]
 
     def said(self, field: AbstractField, seen: Shown, log: Log) -> Told:
         """What the clip says around what was learned."""
@@ -336,9 +361,11 @@ class Learn:
         said: Told,
         course: list[Point],
         beyond: Beyond,
+        omega: float,
         log: Log,
     ) -> dict[str, Interval]:
-        """Of every learned number; `course`: what was tried; `beyond`: what pictures do not show."""
+        """Of every learned number; `course`: what was tried; `beyond`: what pictures do not show; `omega` of the
+        motion [1/s]."""
         unit = field.velocity_scale or 1.0
         speed = [float(v) / unit for v in field.velocity(theta)] if field.velocity_scale else []
         stiff = np.array([float(is_stiff(name)) for name in field.names])
@@ -349,7 +376,7 @@ class Learn:
             theta.detach().numpy(),
             said,
             before=self.before(field),
-            beyond=beyond.covariance(stiff, fast, seen.push, of_branches(field.names, values)),
+            beyond=beyond.covariance(stiff, fast, seen.push, of_branches(field.names, values, omega)),
         )
         return intervals(field, widened(after, course, seen.evidence, log))
 

@@ -205,7 +205,8 @@ def _signed_distance(
     scene.add_triangles(o3d.core.Tensor(points), o3d.core.Tensor(triangles.astype(np.uint32)))
     local = np.ascontiguousarray(places if relative else places - origin, np.float32)
     # rays through edges may be counted twice: three samples outvote one
-    return scene.compute_signed_distance(o3d.core.Tensor(local), nthreads=1, nsamples=3).numpy()
+    distance = scene.compute_signed_distance(o3d.core.Tensor(local), nthreads=1, nsamples=3).numpy()
+    return distance.copy()  # kept for long, and Open3D lets a process fail that ends while its own memory is in use
 
 
 def _cross(w: np.ndarray) -> np.ndarray:

@@ -1,7 +1,8 @@
 """Where theta has been while it was learned, and how well it did there: a point for every trial and every step.
 
 Losses of the search and the polish are over all views and frames, those of the descent over the ones drawn for a step,
-but for its last point. The last point of all is what was learned.
+but for its last point. "across" is where a polish ended in the valley that was left (`mirror.py`). The last point of
+all is what was learned.
 """
 
 from collections.abc import Sequence
@@ -13,14 +14,14 @@ from torch import Tensor
 
 from physics3d.learning.fields import AbstractField, physical
 
-WAYS = ("search", "descent", "polish")
+WAYS = ("search", "descent", "polish", "across")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Point:
     """One of them."""
 
-    way: Literal["search", "descent", "polish"]  # in which it was reached
+    way: Literal["search", "descent", "polish", "across"]  # in which it was reached
     theta: Float[Tensor, " k"]
     loss: float
 

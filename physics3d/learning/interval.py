@@ -16,8 +16,9 @@ in newtons (0 where what drives the motion is a known motion, an acceleration, o
                      E whatever it weighs (phi = -1); one that makes it swing says both
     length           e = 2 1_m + 4 phi: E goes with rho L^2; and velocities with L
     force            e = phi: a thing that was pushed harder than is said seems softer
-    branches         e = 1/share of a branch's modulus in the stiffness of fast motion, 0 else: half of surface and grid
-                     together, which need not be the same in slow and fast modes. A branch is known by the difference
+    branches         e = 1/share of a branch's modulus in the stiffness of fast motion: half of surface and grid
+                     together, which need not be the same in slow and fast modes. A branch is known by the difference.
+                     Its time changes by so much that the swing is damped as it was (`mirror.time_by_modulus`); 0 else
 
 phi is exact where all that is stiff is learned. theta is ln of a number, of Poisson's ratio ln K/mu, or a velocity in
 its own unit (`fields.py`), so a 90 % interval of the number follows from that of theta.
@@ -37,6 +38,7 @@ from jaxtyping import Float
 from physics3d.checks import require_fields
 from physics3d.filling.section import Section
 from physics3d.learning.fields import AXES, AbstractField, is_poissons_ratio, physical
+from physics3d.learning.mirror import time_by_modulus
 from physics3d.learning.sandwich import NORMAL, Evidence, spread
 from physics3d.log import Log
 from physics3d.world import Interval
@@ -199,8 +201,9 @@ def is_stiff(name: str) -> bool:
     return re.sub(r"_[23]$", "", name.split("+")[0]).endswith(STIFF)
 
 
-def of_branches(names: Sequence[str], values: Mapping[str, float]) -> Float[np.ndarray, " k"]:
-    """1/share of each component of theta that is a branch's shear modulus, in that of fast motion; 0 of the others.
+def of_branches(names: Sequence[str], values: Mapping[str, float], omega: float) -> Float[np.ndarray, " k"]:
+    """1/share of each component of theta that is a branch's shear modulus, in that of fast motion; of the relaxation
+    time of a single branch what then keeps the damping of a swing of `omega` [1/s]; 0 of the others.
 
     `names` of the components (`a+b` where tied), `values` [SI] of all parameters."""
     branch = {name: value for name, value in values.items() if name.startswith("branch_shear_modulus")}
@@ -210,7 +213,11 @@ def of_branches(names: Sequence[str], values: Mapping[str, float]) -> Float[np.n
         slow = values.get("shear_modulus", 0.0)
     fast = slow + sum(branch.values())
     own = [sum(branch.get(part, 0.0) for part in name.split("+")) for name in names]
-    return np.array([fast / value if value > 0 else 0.0 for value in own])
+    change = np.array([fast / value if value > 0 else 0.0 for value in own])
+    if len(branch) == 1 and omega > 0:
+        time = np.array(["shear_relaxation_time" in name.split("+") for name in names])
+        change = change + time * change.sum() * time_by_modulus(omega * values["shear_relaxation_time"])
+    return change
 
 
 def words(found: Interval) -> str:

@@ -7,7 +7,8 @@ none of them is deep. With n independent looks at residuals of unknown size, and
     n ln(L_tried/L_found) < chi^2_1(0.9)        the tried one lies within the 90 % that a likelihood ratio leaves
 
 (Wilks 1938, the variance profiled out). A rival outside the local interval is another valley; it stands for all that is
-nearer to it than to what else was tried, and intervals reach as far as that. (A search whose steps skip whole valleys
+nearer to it than to what else was tried, and intervals reach as far as that. One in which a polish ended (`mirror.py`)
+is a valley as wide as that of the answer. (A search whose steps skip whole valleys
 may have skipped the best: where swings are aliased 90 % hold 75 % of the truths, and without rivals 3 %.)
 """
 
@@ -27,9 +28,9 @@ BOUND = float(stats.chi2.ppf(CERTAIN, 1))
 
 
 def rivals(course: Sequence[Point], evidence: Evidence) -> list[Point]:
-    """Points of the search that do as well as the last of the course, as far as the independent places and times of the
-    evidence tell. Their losses, and the last one, are over all that was filmed."""
-    tried = [point for point in course if point.way == "search"]
+    """Points of the search, and ends of other valleys, that do as well as the last of the course, as far as the
+    independent places and times of the evidence tell. Their losses, and the last one, are over all that was filmed."""
+    tried = [point for point in course if point.way in ("search", "across")]
     if not tried:
         return []
     known = spread(evidence)
@@ -50,22 +51,33 @@ def widened(found: Posterior, course: Sequence[Point], evidence: Evidence, log: 
     tried = np.array([padded(point) for point in course if point.way == "search"]).reshape(-1, len(low))
     tried = np.unique(tried, axis=0)
     varied = np.ptp(tried, axis=0) > 0 if len(tried) else np.zeros(len(low), bool)
-    others = [padded(point) for point in rivals(course, evidence)]
+    equal = rivals(course, evidence)
+    ends = [padded(point) for point in equal if point.way == "across"]
+    others = [padded(point) for point in equal if point.way == "search"]
     others = [other for other in others if ((other < low) | (other > high))[varied].any()]
-    if not others:
-        return found
-    distance = np.linalg.norm(tried[:, None] - tried[None], axis=2)
-    half = np.abs(tried[np.where(distance > 0, distance, np.inf).argmin(1)] - tried) / 2  # to the next that was tried
-    mine = [int(np.linalg.norm(tried - other, axis=1).argmin()) for other in others]
-    reach = np.stack([side * half[i] + other for i, other in zip(mine, others) for side in (-1, 1)])
-    reach = reach.clip(-NORMAL * found.before, NORMAL * found.before)
-    lower = np.where(varied, np.minimum(low, reach.min(0)), low)
-    upper = np.where(varied, np.maximum(high, reach.max(0)), high)
+    lower, upper = low, high
+    if others:
+        distance = np.linalg.norm(tried[:, None] - tried[None], axis=2)
+        nearest = np.where(distance > 0, distance, np.inf).argmin(1)
+        half = np.abs(tried[nearest] - tried) / 2  # to the next that was tried
+        mine = [int(np.linalg.norm(tried - other, axis=1).argmin()) for other in others]
+        reach = np.stack([side * half[i] + other for i, other in zip(mine, others) for side in (-1, 1)])
+        reach = reach.clip(-NORMAL * found.before, NORMAL * found.before)
+        lower = np.where(varied, np.minimum(low, reach.min(0)), low)
+        upper = np.where(varied, np.maximum(high, reach.max(0)), high)
+    for end in ends:
+        lower, upper = np.minimum(lower, end - NORMAL * deviation), np.maximum(upper, end + NORMAL * deviation)
     factor = (upper - lower) / (high - low)
     if (factor < 1.01).all():
         return found
-    log.warn(
-        f"{len(others)} of the stiffnesses that the search tried explain the clip as well as the one that was learned; "
-        "the intervals reach as far: record for longer, more frames, or another push"
-    )
+    if ends:
+        log.warn(
+            "a relaxation time on the other side of the period of the swing explains the clip as well; the intervals "
+            "hold both: record how the thing gives way to a steady force, or a swing of another frequency"
+        )
+    if others:
+        log.warn(
+            f"{len(others)} of the stiffnesses that the search tried explain the clip as well as the one that was "
+            "learned; the intervals reach as far: record for longer, more frames, or another push"
+        )
     return replace(found, mean=(lower + upper) / 2, covariance=found.covariance * factor[:, None] * factor)
