@@ -29,7 +29,7 @@ from physics3d.log import Log
 from physics3d.materials.base import Values
 from physics3d.materials.mixture import PART
 from physics3d.matter import Matter
-from physics3d.modes.dynamics import GAIN, NotSolved, Step, System
+from physics3d.modes.dynamics import NotSolved, Step, System
 from physics3d.modes.model import MODES, QUADRATURE, Model, model
 from physics3d.modes.vibration import Mode
 from physics3d.trajectory import Trajectory
@@ -39,6 +39,11 @@ STEPS = 24  # in a period of the fastest mode that matters
 SHARE = 0.01  # of the energy, from which on a mode matters
 LATE = 0.02  # of a period at the end, from which on steps are shorter than that
 MOST_FINER = 4  # times, in a frame
+# of the largest energy so far, that a motion may gain beyond the work of the loads: what is less comes and goes with
+# the phase of a large swing, or with the length of a step. More is tried with steps of half the length, so many times
+GAIN = 0.1
+ENERGY_TRIES = 4
+REMEDY = "take a weaker force, a slower start, a smaller world.dt or world.solver='grid'"
 FAR = 1.4  # stretched by more, a body is beyond what the basis was compared in
 TRIES = 6
 
@@ -168,6 +173,7 @@ class Solver:
         loads = self._loads()
         run = _Run(
             solver=self,
+            coefficients=coefficients.detach().numpy(),
             system=body.system(coefficients.detach().numpy()),
             frames=frames,
             frame_dt=frame_dt,
@@ -219,6 +225,7 @@ class _Run:
     """The loop over frames; `_Motion` is its face to torch."""
 
     solver: Solver
+    coefficients: np.ndarray  # at the points of integration [k, n]
     system: System
     frames: int
     frame_dt: float
@@ -226,19 +233,23 @@ class _Run:
     counts: list[int] = field(default_factory=list)
     health: dict[str, list[float]] = field(default_factory=dict)
     taken: list[list] = field(default_factory=list)
-    # of each frame: amplitudes [r, 3] in m and m/s, history, iterations and matrices of Newton's method
-    seen: list[tuple[np.ndarray, np.ndarray, np.ndarray, int, int]] = field(default_factory=list)
+    # of each frame: amplitudes [r, 3] in m and m/s, history, iterations and matrices of Newton's method, last midpoint
+    seen: list[tuple[np.ndarray, np.ndarray, np.ndarray, int, int, tuple]] = field(default_factory=list)
 
     def forward(self, v: np.ndarray, loads: np.ndarray, keep: bool) -> np.ndarray:
         """Amplitudes [t, r, 3] of every frame."""
-        q = np.zeros_like(v)
-        found = [q]
-        self._look(q, v)
-        count = self._count(v, loads)
-        for frame in range(1, self.frames):
-            q, v, count = self._frame(frame, q, v, loads, count, keep)
-            found.append(q)
-            self._look(q, v)
+        world, count = self.solver.world, self._count(v, loads)
+        for tried in range(1, ENERGY_TRIES + 1):
+            found = self._frames(v, loads, count, keep)
+            gained, frame = self._gained(v)
+            if gained <= GAIN:
+                break
+            if tried == ENERGY_TRIES or 2 * count > world.max_substeps or world.dt is not None:
+                raise NotSolved(
+                    f"frame {frame}: the motion gains {100 * gained:.2g} % of its energy from nowhere with steps of "
+                    f"{self.frame_dt / self.counts[frame - 1]:g} s; {REMEDY}"
+                )
+            count *= 2
         self.health = {name: [float(value) for value in curve] for name, curve in self._record().items()}
         stretch = self.health["stretch_max"]
         if max(stretch) > FAR:
@@ -246,7 +257,28 @@ class _Run:
                 f"the body is stretched by {max(stretch):.2g} in frame {int(np.argmax(stretch))}; the basis is made "
                 "for what bends and turns, and may be wrong there: compare with world.solver='grid'"
             )
-        return np.stack(found)
+        return found
+
+    def _frames(self, v: np.ndarray, loads: np.ndarray, count: int, keep: bool) -> np.ndarray:
+        """`forward` from the start on by so many steps a frame, or more."""
+        self.system = self.solver.model.system(self.coefficients)
+        self.counts, self.taken, self.seen = [], [], []
+        q = np.zeros_like(v)
+        self._look(q, v, (q, v, 0.0))
+        for frame in range(1, self.frames):
+            q, v, count = self._frame(frame, q, v, loads, count, keep)
+            self._look(q, v, self.system.midpoint)
+        return np.stack([seen[0] for seen in self.seen])
+
+    def _gained(self, v: np.ndarray) -> tuple[float, int]:
+        """The most that the energy has grown beyond the work of the loads, of its largest so far, and in which frame.
+        What is lost does not make good for it."""
+        x, w, work = (np.array(one) for one in zip(*(seen[-1] for seen in self.seen), strict=True))
+        memory = np.array([seen[2] for seen in self.seen])
+        energy = 0.5 * np.einsum("tri,rs,tsi->t", w, self.system.mass, w) + self.system.stored(x, memory)
+        surplus = energy - work
+        share = (surplus - np.minimum.accumulate(surplus)) / np.maximum(np.maximum.accumulate(energy), 1e-300)
+        return float(share.max()), int(share.argmax())
 
     def backward(self, q_bar: np.ndarray, loads: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Adjoints of the coefficients [k, n], the start [r, 3] and the loads, from those of the frames."""
@@ -269,13 +301,12 @@ class _Run:
         for tried in range(1, TRIES + 1):
             taken: list | None = [] if keep else None
             try:
-                q_new, v_new = self.system.run(q, v, loads, self._plan(frame, count), taken, GAIN)
+                q_new, v_new = self.system.run(q, v, loads, self._plan(frame, count), taken)
                 break
             except NotSolved as reason:
                 if tried == TRIES or 2 * count > world.max_substeps or world.dt is not None:
                     raise NotSolved(
-                        f"frame {frame}: {reason} with steps of {self.frame_dt / count:g} s; take a weaker force, a "
-                        "slower start, a smaller world.dt or world.solver='grid'"
+                        f"frame {frame}: {reason} with steps of {self.frame_dt / count:g} s; {REMEDY}"
                     ) from None
                 count *= 2
         self.counts.append(count)
@@ -337,16 +368,16 @@ class _Run:
         half = omega * dt / 2
         return float(share @ (omega / (2 * math.pi) * (1 - np.arctan(half) / half))) * self.frame_dt * (self.frames - 1)
 
-    def _look(self, q: np.ndarray, v: np.ndarray) -> None:
+    def _look(self, q: np.ndarray, v: np.ndarray, midpoint: tuple[np.ndarray, np.ndarray, float]) -> None:
         """Keep what the record of a frame is made of."""
         system = self.system
-        self.seen.append((q, v, system.points.data["memory"].copy(), system.iterations, system.matrices))
+        self.seen.append((q, v, system.points.data["memory"].copy(), system.iterations, system.matrices, midpoint))
         system.iterations = system.matrices = 0
 
     def _record(self) -> dict[str, np.ndarray]:
         """Health of all frames, by the names of the solver with a grid."""
         world, body = self.solver.world, self.solver.model
-        q, v, memory, iterations, matrices = (np.array(one) for one in zip(*self.seen, strict=True))
+        q, v, memory, iterations, matrices = (np.array(one) for one in list(zip(*self.seen, strict=True))[:-1])
         F = (body.gradient @ q).reshape(len(q), -1, 3, 3) + np.eye(3)
         J = np.linalg.det(F)
         stretch = np.sqrt(np.linalg.eigvalsh(F @ F.swapaxes(2, 3)).max((1, 2)))

@@ -67,9 +67,9 @@ def test_more_steps_than_are_allowed_are_refused():
 
 
 def test_a_motion_that_gains_energy_is_refused():
-    """A beam that is thrown, by ten steps to a period: these serve a small swing; one that is thrown round itself
-    explodes."""
-    for speed, serves in ((0.01, True), (2.0, False)):
+    """A beam that is thrown, by ten steps to a period: these serve a small swing; of one half round itself the energy
+    grows by half in two periods."""
+    for speed, serves in ((0.01, True), (0.6, False)):
         solver, velocity = thrown(speed=speed, steps=10)
         timing = dict(velocity=velocity, frames=21, frame_dt=solver.world.dt, log=Log(None))
         if serves:
