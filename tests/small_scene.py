@@ -30,7 +30,7 @@ DX = 0.05
 POKE = (Impulse(force=(1.2, 0.0, 0.0), centre=(0.0, 0.0, 0.4), radius=0.12, start=0.0, duration=0.1),)
 
 
-def world(start: dict[str, float], precision: str = "float32") -> World:
+def world(start: dict[str, float], precision: str = "float32", solver: str = "grid") -> World:
     return World(
         material=Viscoelastic(branches=1 if "branch_shear_modulus" in start else 0),
         density=300.0,
@@ -39,6 +39,7 @@ def world(start: dict[str, float], precision: str = "float32") -> World:
         gravity=(0.0, 0.0, 0.0),
         boundaries=(FixedRegion(lower=(-1.0, -1.0, -1.0), upper=(1.0, 1.0, 0.06)),),
         precision=precision,
+        solver=solver,
     )
 
 
@@ -76,8 +77,8 @@ def cameras(count: int = 1) -> tuple[Camera, ...]:
 
 def learner(start: dict[str, float], learn: tuple[str, ...], **options) -> Learn:
     options = {"steps": 12, "learning_rate": 0.15, "frames": 10, "image_scale": 1.0, "stay": 0.0} | options
-    precision = options.pop("precision", "float32")
-    return Learn(world=world(start, precision), prior=options.pop("prior", Exemplar()), learn=learn, **options)
+    precision, solver = options.pop("precision", "float32"), options.pop("solver", "grid")
+    return Learn(world=world(start, precision, solver), prior=options.pop("prior", Exemplar()), learn=learn, **options)
 
 
 def bar_chain(world: World, field: GlobalField, clip: Capture, frames: int) -> Chain:
@@ -100,7 +101,9 @@ def bar_chain(world: World, field: GlobalField, clip: Capture, frames: int) -> C
     )
 
 
-def capture(truth: dict[str, float], *, frames: int = 10, fps: float = 20.0, views: int = 1, held_out=()) -> Capture:
+def capture(
+    truth: dict[str, float], *, frames: int = 10, fps: float = 20.0, views: int = 1, held_out=(), solver: str = "grid"
+) -> Capture:
     """Clips rendered by the code under test, with the true parameters."""
     gaussians, _ = bar()
     blank = tuple(torch.zeros((frames, c.height, c.width, 3), dtype=torch.uint8) for c in cameras(views))
@@ -109,7 +112,7 @@ def capture(truth: dict[str, float], *, frames: int = 10, fps: float = 20.0, vie
     )
     empty = Capture(name="bar", images=(), cameras=(), names=(), gaussians=gaussians, takes=(take,), truth=truth)
     field = GlobalField(start=world(truth).estimate().parameters, learn=("youngs_modulus",))
-    chain = bar_chain(world(truth), field, empty, frames)
+    chain = bar_chain(world(truth, solver=solver), field, empty, frames)
     with torch.no_grad():
         motion = chain.simulate(field.zero())
         videos = [chain.render(motion, view, torch.arange(frames)) for view in range(views)]

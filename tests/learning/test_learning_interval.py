@@ -220,8 +220,11 @@ def test_a_branch_is_known_by_what_it_adds():
     spring, branch, wide = 5.0e4, 1.0e4, 0.06
     names = ("youngs_modulus", "branch_shear_modulus+branch_bulk_modulus", "shear_relaxation_time")
     values = {"youngs_modulus": 2.6 * spring, "poissons_ratio": 0.3, "branch_shear_modulus": branch}
-    share = of_branches(names, values)
+    share = of_branches(names, values, 0.0)
     assert share == pytest.approx([0, (spring + branch) / branch, 0])
+    # its time follows, so that the damping of a swing stays: for one far below the period as 1/m
+    short = of_branches(names, values | {"shear_relaxation_time": 1e-3}, 1.0)
+    assert short == pytest.approx([0, share[1], -share[1]], rel=1e-4)
     none = dict(grid=0.0, density=0.0, length=0.0, force=0.0)
     flat = np.zeros(3)
     W = Beyond(surface=wide, **none).covariance(flat, flat, flat, share)

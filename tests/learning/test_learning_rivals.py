@@ -70,3 +70,21 @@ def test_intervals_do_not_reach_beyond_what_was_thought_before(tmp_path):
     assert wide.mean[0] + reach[0] == pytest.approx(NORMAL * 0.5)
     assert [wide.mean[1], reach[1]] == pytest.approx([0.0, NORMAL * 0.1])
     assert "as well as the one that was learned" in (tmp_path / "log.txt").read_text()
+
+
+def test_an_interval_holds_the_other_valley_where_it_is_as_deep(tmp_path):
+    """Two ends of a polish: both intervals where they do as well, that of the answer where the other is worse."""
+    found = Posterior(mean=np.zeros(2), covariance=0.01 * np.eye(2), before=np.full(2, 5.0))
+    even = Evidence(JJ=np.eye(2), score=np.ones((4, 4, 2)), share=np.ones((4, 4, 2)))
+    half = NORMAL * 0.1
+    for loss, reach in ((1.02, 1.5 + half), (9.0, half)):
+        course = [
+            Point(way="across", theta=torch.tensor([1.5, -1.0]), loss=loss),
+            Point(way="polish", theta=torch.zeros(2), loss=1.0),
+        ]
+        wide = widened(found, course, even, Log(tmp_path, quiet=True))
+        high = wide.mean + NORMAL * np.sqrt(wide.covariance.diagonal())
+        low = wide.mean - NORMAL * np.sqrt(wide.covariance.diagonal())
+        assert high[0] == pytest.approx(reach) and low[0] == pytest.approx(-half)
+        assert low[1] == pytest.approx(-half if loss > 2 else -1.0 - half) and high[1] == pytest.approx(half)
+    assert "explains the clip as well" in (tmp_path / "log.txt").read_text()
