@@ -121,7 +121,7 @@ def measure(run: Run) -> list[tuple[str, ...]]:
 
 
 def time_of(page: Page) -> float:
-    return page.live.stepper.time if page.live is not None else 0.0
+    return page.live.time if page.live is not None else 0.0
 
 
 def upper(run: Run) -> int:
