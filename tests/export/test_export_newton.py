@@ -45,11 +45,9 @@ def frequency(way: np.ndarray, dt: float) -> float:
 
 
 def by_newton(path, velocity: np.ndarray, top: np.ndarray) -> np.ndarray:
-    """Mean way of the top [m] along x, step by step. What the file says is held becomes particles without mass, which is
-    how Newton holds them."""
-    newton = pytest.importorskip(
-        "newton", reason="newton is not installed; pip install newton usd-core"
-    )
+    """Mean way of the top [m] along x, step by step. What the file says is held becomes particles without mass, which
+    is how Newton holds them."""
+    import newton
     from newton.solvers import SolverImplicitMPM
     from pxr import Usd, UsdGeom
 
