@@ -113,6 +113,10 @@ class Stepper:
         u, H, v = (value[self._back].double() for value in (now.u, now.H, now.v))
         return self.setting.position + u, H + torch.eye(3, dtype=torch.float64), v
 
+    def stress(self) -> Float[Tensor, "p 3 3"]:
+        """Kirchhoff stress of the particles at present [Pa]."""
+        return self._frames.now.tau[self._back].double()
+
     def _started(self, parameters: Values) -> Frames:
         """At rest, with these parameters; the hand keeps what it has chosen."""
         start_warp()

@@ -27,11 +27,12 @@ from physics3d.materials.base import Values
 from physics3d.mpm.stepping import Stepper
 from physics3d.view.coarse import Coarse, coarser
 from physics3d.view.mover import AbstractMover, TooMuch
+from physics3d.view.quantities import von_mises_of_kirchhoff
 from physics3d.world import World
 
 RATE = 4e5  # particles times substeps, in a second of the clock: a fifth of what an idle core does
 CELLS = 8  # along the longest side of the body, at least
-ONE = 4e4  # particles times substeps in one step, at most: between two pictures there is to be time for one
+ONE = 2e4  # particles times substeps in one step, at most: between two pictures there is to be time for one
 ALIKE = 1.2  # factor below which the body is moved with its own particles
 STEP = 1 / 120  # the longest [s]
 PERIOD = 0.3  # in which the hand would swing with the body, were it not damped [s]
@@ -125,6 +126,10 @@ class ByGrid(AbstractMover):
 
     def particles(self) -> tuple[Float[Tensor, "p 3"], Float[Tensor, "p 3 3"], Float[Tensor, "p 3"]]:
         return self.coarse.fine(*self._stepper.particles())
+
+    def stress(self) -> Float[np.ndarray, " p"] | None:
+        _, F, _ = self._stepper.particles()
+        return self.coarse.blend(von_mises_of_kirchhoff(self._stepper.stress().numpy(), F.numpy()))
 
     def speed(self) -> float:
         return float(self._stepper.particles()[2].norm(dim=1).max())

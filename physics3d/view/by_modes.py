@@ -31,7 +31,7 @@ MOST_PIECES = 100_000  # particles: modes of 78 000 take a core 50 s, once, and 
 
 
 class ByModes(AbstractMover):
-    still, how, notes = 1e-4, "", ()
+    still, how, notes = 1e-4, "Moved by its modes of vibration, without a grid.", ()
 
     def __init__(self, stepper: Stepper, body: Body, parameters: Values, *, damping: float):
         self.stepper, self._body, self._parameters, self._damping = stepper, body, parameters, damping

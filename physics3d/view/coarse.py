@@ -55,12 +55,15 @@ class Coarse:
     def fine(
         self, x: Float[Tensor, "c 3"], F: Float[Tensor, "c 3 3"], v: Float[Tensor, "c 3"]
     ) -> tuple[Float[Tensor, "p 3"], Float[Tensor, "p 3 3"], Float[Tensor, "p 3"]]:
-        """Positions [m], deformation gradients and velocities [m/s] of the body's particles."""
+        """Positions [m], deformation gradients and velocities [m/s] of the body's particles; in float32 if carried."""
         if self.carried is None:
             return x, F, v
         place, G = self.carried(x, F)
-        speed = self.carried.blend(v.numpy())
-        return _tensor(place.T), _tensor(G.transpose(2, 0, 1)), _tensor(speed)
+        return _tensor(place.T), _tensor(G.transpose(2, 0, 1)), _tensor(self.blend(v.numpy()))
+
+    def blend(self, value: Float[np.ndarray, "c *k"]) -> Float[np.ndarray, "p *k"]:
+        """Numbers of these particles, at the body's own."""
+        return value if self.carried is None else self.carried.blend(value.astype(np.float32))
 
 
 def coarser(body: Body, world: World, factor: float) -> Coarse:
@@ -96,7 +99,7 @@ def coarser(body: Body, world: World, factor: float) -> Coarse:
 
 
 def _tensor(value: np.ndarray) -> Tensor:
-    return torch.from_numpy(np.ascontiguousarray(value)).double()
+    return torch.from_numpy(np.ascontiguousarray(value))
 
 
 def _holds(body: Body, world: World) -> list[np.ndarray]:

@@ -28,7 +28,7 @@ from physics3d.view.quantities import Stress
 from physics3d.world import World
 
 MOST = 0.1  # of the clock that one call makes up for [s]
-LONGEST = 0.03  # that one call takes, and the step that it is in [s]: there are to be 15 pictures a second
+LONGEST = 0.025  # that one call takes, and the step that it is in [s]: there are to be 15 pictures a second
 RECENT = 30  # calls, of which it is said how fast time passes
 
 
@@ -52,7 +52,8 @@ class Live:
         self.quiet = 0.0  # for how long it has not moved [s]
         self._passed: deque[tuple[float, float]] = deque(maxlen=RECENT)  # (of the clock, of the body) [s]
         self._size = float((body.position.amax(0) - body.position.amin(0)).max())
-        self.stress = self._unstressed()
+        self._stress = self._unstressed()
+        self._stressed_at = 0.0  # time of the last stress that was asked of the material [s]
 
     @classmethod
     def of(cls, world: World, body: Body, parameters: Values, *, log: Log) -> "Live":
@@ -113,18 +114,18 @@ class Live:
             self.stiffness, self.damping = stiffness, damping
             parameters, self.quiet = scaled(self.parameters, stiffness), 0.0
             self.mover.change(parameters, damping=damping)
-            if self.stress is not None:
-                self.stress.change(parameters)
+            if self._stress is not None:
+                self._stress.change(parameters)
 
     def rest(self) -> None:
         """Undeformed and still, as at the start."""
         self.mover.rest()
         self.hold, self.late, self.quiet = None, 0.0, 0.0
-        self.stress = self._unstressed()
+        self._stress, self._stressed_at = self._unstressed(), 0.0
 
     def _unstressed(self) -> Stress | None:
-        """None: of a material that flows no stress is kept."""
-        if not self.world.material.recovers:
+        """None: the mover knows it, or the material flows and keeps none."""
+        if self.mover.stress() is not None or not self.world.material.recovers:
             return None
         return Stress(self.world.material, scaled(self.parameters, self.stiffness), len(self.body.position))
 
@@ -160,6 +161,17 @@ class Live:
         x, F, v = self.mover.particles()
         self.trouble = self.mover.unfelt(x) or self.trouble
         return x, F, v
+
+    def stress(self, F: Float[Tensor, "p 3 3"]) -> Float[np.ndarray, " p"] | None:
+        """Von Mises [Pa] at the present deformation; to be asked in every picture, for a material may remember. None
+        where no stress is shown, of a material that flows."""
+        if not self.world.material.recovers:
+            return None
+        if self._stress is None:
+            return self.mover.stress()
+        found = self._stress.after(F, max(self.time - self._stressed_at, 1e-9))
+        self._stressed_at = self.time
+        return found
 
 
 def scaled(parameters: Values, factor: float) -> Values:

@@ -18,8 +18,8 @@ class AbstractMover(abc.ABC):
 
     dt: float  # of a step [s]
     still: float  # of the body's size per second: who moves less for a second has come to rest
-    how: str  # what a person has to know of how it is moved; "": nothing
-    notes: tuple[str, ...]  # the same, for the file of a poke
+    how: str  # it is moved, in a sentence for a person
+    notes: tuple[str, ...]  # how that differs from the scene, for the file of a poke
 
     @property
     @abc.abstractmethod
@@ -56,6 +56,10 @@ class AbstractMover(abc.ABC):
     @abc.abstractmethod
     def speed(self) -> float:
         """Of the fastest part of the body [m/s]."""
+
+    def stress(self) -> Float[np.ndarray, " p"] | None:
+        """Von Mises stress of the body's particles [Pa]; None: it has to be asked of the material."""
+        return None
 
     def unfelt(self, position: Float[Tensor, "p 3"]) -> str:
         """What the body reaches at `position` [m] and does not feel, in one line; "": nothing."""

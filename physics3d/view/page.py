@@ -54,7 +54,6 @@ class Page:
         eye = camera.centre.numpy() if camera is not None else middle + 2 * SIZE / self.pictures.scale * AHEAD
         self.eye = eye.astype(float)
         self._drawn_from: tuple[Kind, np.ndarray] | None = None  # what the still background has the colours of
-        self._stressed_at = 0.0  # time of the last stress of the live body [s]
         self._grip = np.zeros(3)  # where the hand took hold [units]
         self._said = 0.0  # when the rate was said last [s]
         self._spent: deque[tuple[float, float, float, int, int]] = deque(maxlen=60)  # of frames, see `rate`
@@ -238,11 +237,8 @@ class Page:
         motion = self.run.trajectory
         if self.mode == "live" and self.live is not None:
             x, F, v = self.live.particles()
-            stress = None
-            if self.live.stress is not None:
-                stress = self.live.stress.after(F, max(self.live.time - self._stressed_at, 1e-9))
-            self._stressed_at = self.live.time
-            return Moment(position=x, deformation=F, speed=np.linalg.norm(v.numpy(), axis=1), stress=stress)
+            speed = np.linalg.norm(v.numpy(), axis=1)
+            return Moment(position=x, deformation=F, speed=speed, stress=self.live.stress(F))
         return self.pictures.moment(min(int(self.time * motion.fps + 1e-6), len(motion.position) - 1))
 
     def _draw(self) -> tuple[int, int]:
@@ -255,7 +251,7 @@ class Page:
             _send(node, shown)
             self._moving.visible, self._particles.visible = not self._balls.value, self._balls.value
             self._background(kind)
-            at = now.position.double().numpy()[self._held_by] * scale
+            at = now.position.numpy()[self._held_by] * scale
             self._handles.batched_positions = at.astype(np.float32)
             self._follow_clip()
             self._clock.value = min(self.time, self._clock.max) if self.mode == "run" else self._clock.value
@@ -348,14 +344,13 @@ class Page:
         again = "Let go; " + POKE[0].lower() + POKE[1:]
         lines = [f"Pulled with **{force:.2g} N**." if live.hold is not None else again]
         lines += [f"*{live.trouble}.*"] if live.trouble else []
-        lines += [live.mover.how] if live.mover.how else []
+        lines += [live.mover.how]
         lines += [f"Time passes at **{live.pace:.2f}** of the clock."] if live.pace < SLOW else []
         return "\n\n".join(lines)
 
     def _invitation(self) -> str:
         """What to do, before anybody has."""
-        how = self.live.mover.how if self.live is not None else ""
-        return POKE + (f"\n\n{how}" if how else "")
+        return POKE if self.live is None else f"{POKE}\n\n{self.live.mover.how}"
 
     def _legend_of(self, kind: Kind) -> str:
         style = 'style="padding:0 1em;font-size:85%"'
