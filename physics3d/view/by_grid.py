@@ -30,7 +30,7 @@ from physics3d.view.mover import AbstractMover, TooMuch
 from physics3d.view.quantities import von_mises_of_kirchhoff
 from physics3d.world import World
 
-RATE = 4e5  # particles times substeps, in a second of the clock: a fifth of what an idle core does
+RATE = 4e5  # particles times substeps, in a second of the clock: a fifth of what a core does that has other work too
 CELLS = 8  # along the longest side of the body, at least
 ONE = 2e4  # particles times substeps in one step, at most: between two pictures there is to be time for one
 ALIKE = 1.2  # factor below which the body is moved with its own particles
