@@ -47,7 +47,7 @@ class ByModes(AbstractMover):
             raise Refused(FREE)
         part = lambda values: world.material.per_part(values, body.part, body.parts)
         solver = modes_of(
-            world, body.position, body.volume,
+            world.starting_at(parameters), body.position, body.volume,
             excitation=body.held, part=part, matter=body.matter, most=MOST_PIECES, log=log,
         )  # fmt: skip
         model = solver.model
