@@ -1,7 +1,8 @@
 """What a scene says of its physics, and what learning found out about it."""
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
 import torch
@@ -88,6 +89,12 @@ class World:
     @property
     def dtype(self) -> torch.dtype:
         return PRECISIONS[self.precision]
+
+    def starting_at(self, parameters: Mapping[str, Tensor]) -> "World":
+        """With these for a start, those that vary over the body by their means: what is made for a material, as modes
+        and what holds them are, is then made for this one."""
+        start = {name: float(torch.as_tensor(parameters[name]).double().mean()) for name in self.start}
+        return replace(self, start=start)
 
     def estimate(self) -> Estimate:
         """The initial guess: the start values and velocity. Raises ValueError as `check` does."""

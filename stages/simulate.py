@@ -43,7 +43,7 @@ class Simulate:
         with torch.no_grad():
             part = lambda values: self.world.material.per_part(values, body.part, body.parts)
             motion = motion_of(
-                self.world,
+                self.world.starting_at(estimate.parameters),
                 body.position,
                 body.volume,
                 excitation=(*body.held, *excitation),

@@ -34,7 +34,7 @@ PIN = 1e3  # stiffness of a pin, in that of a cube of the piece behind it
 MODES = 12  # of vibration, whose components are fields of the basis
 QUADRATURE = 300  # points of integration
 SMOOTH = 30.0  # times the highest mode: what would swing faster is smoothed out of a start
-RIGID = 1e-3  # of the highest mode: what swings slower is a rigid motion of a free body
+RIGID = 1e-3  # of the highest mode: what swings slower is a rigid motion, if nothing holds the body
 MOST_GROUPS = 8  # materials that differ; more are a field
 
 
@@ -97,12 +97,13 @@ class Model:
         whole = vibration.stiffness(self.gradient, stuck) + held_by
         mass, faint = np.kron(self.mass, np.eye(3)), 1e-6 * self.omega.max() ** 2
         square, found = vibration.dense_modes(whole, mass, len(self.omega), shift=faint)
-        swings = square > (RIGID * np.sqrt(square.max())) ** 2
+        held = any(spring.pull is None for spring in self.springs)
+        swings = np.full(len(square), held) | (square > (RIGID * np.sqrt(square.max())) ** 2)
         shapes = found.T.reshape(len(square), -1, 3)[swings][:count]
         strain = np.stack([(self.gradient @ shape).reshape(-1, 3, 3) for shape in shapes])
         kappa = vibration.relaxation(self.world.material, coefficients, self.weight, strain)
-        held = np.array([sum(np.vdot(s, k.matrix @ s) for k in self.springs if k.pull is None) for s in shapes])
-        return vibration.damped(lambda t: kappa(t) + held)
+        by_holds = np.array([sum(np.vdot(s, k.matrix @ s) for k in self.springs if k.pull is None) for s in shapes])
+        return vibration.damped(lambda t: kappa(t) + by_holds)
 
 
 def model(

@@ -83,12 +83,7 @@ class Frames:
         """Displacements, velocities [t, p, 3] and total deformations [t, p, 3, 3], from the initial velocity [p, 3] and
         its gradient [p, 3, 3]."""
         world, frames, n = self.problem.world, self.problem.frames, self.arrays.n
-        first = self.arrays.state(0)
-        first.memory.copy_(world.material.initial_memory(n, world.dtype))
-        first.v_gathered.copy_(velocity)
-        first.L_gathered.copy_(gradient)
-        self.initial = first.flat.clone() if self.keep else None
-        self.substeps.start(self._clock(0.0, 0.0, 1, kick=0.0), 0, 0)
+        self.begin(velocity, gradient)
         kind: dict[str, Any] = {"dtype": world.dtype, "device": self.problem.device}
         u, v = torch.empty((frames, n, 3), **kind), torch.empty((frames, n, 3), **kind)
         deformation = torch.empty((frames, n, 3, 3), **kind)
@@ -96,13 +91,22 @@ class Frames:
         for frame in self.problem.log.progress(range(frames), "simulate"):
             self.work = Work()
             if frame:
-                self._frame(frame)
-            now = self._now()
+                self.onward(frame)
+            now = self.now
             u[frame], v[frame], deformation[frame] = now.u, self._velocity(frame), now.H + eye
             substeps = self.counts[-1] if self.counts else 0
             for name, value in health(self.body, now, self.work, substeps).items():
                 self.health.setdefault(name, []).append(value)
         return u, v, deformation
+
+    def begin(self, velocity: Tensor, gradient: Tensor) -> None:
+        """Undeformed, with this velocity [p, 3] and its gradient [p, 3, 3]."""
+        first = self.arrays.state(0)
+        first.memory.copy_(self.problem.world.material.initial_memory(self.arrays.n, self.problem.world.dtype))
+        first.v_gathered.copy_(velocity)
+        first.L_gathered.copy_(gradient)
+        self.initial = first.flat.clone() if self.keep else None
+        self.substeps.start(self._clock(0.0, 0.0, 1, kick=0.0), 0, 0)
 
     def backward(self, adjoint_u: Tensor, adjoint_F: Tensor) -> tuple[Tensor, ...]:
         """Gradients of coefficients, q, velocity, its gradient, position, and selection."""
@@ -144,7 +148,7 @@ class Frames:
 
     def _velocity(self, frame: int) -> Tensor:
         """Of the particles at the frame [p, 3]."""
-        now = self._now()
+        now = self.now
         if self.behind == 0:
             return now.v
         dt = 2 * self.behind
@@ -154,27 +158,32 @@ class Frames:
         self.substeps.look(clock, self.current, 1 - self.current)
         return self.arrays.state(1 - self.current).v
 
-    def _now(self) -> State:
+    @property
+    def now(self) -> State:
+        """The particles at present, sorted by cell."""
         return self.arrays.state(self.current)
 
-    def _frame(self, frame: int) -> None:
-        """From one frame to the next, in equal substeps that obey the limit; more of them if it turns out too fast."""
+    def onward(self, frame: int) -> None:
+        """From the frame before to this one, in equal substeps that obey the limit; more of them if it turns out too
+        fast. Raises ValueError as `rollout` does."""
         world, frame_dt = self.problem.world, self.problem.frame_dt
-        start, behind = self._now().flat.clone(), self.behind
+        start, behind = self.now.flat.clone(), self.behind
         begun = sum(len(runs) for runs in self.runs)
         self._choose(frame)
-        count, reach = self._count(frame), 2.0
+        count, reach = self.count(frame), 2.0
         fixed = world.dt is not None
         tries = (1 if self.now_implicit else 3) if fixed else TRIES
         for tried in range(1, tries + 1):
             try:
                 steps = self._implicit_runs if self.now_implicit else self._explicit_runs
-                self.runs.append(steps(frame, count, reach))
+                done = steps(frame, count, reach)
+                if self.keep:
+                    self.runs.append(done)
                 self.counts.append(count)
                 return
             except TooFast as reason:
                 why, remedy = str(reason), reason.remedy
-                self._now().flat.copy_(start)
+                self.now.flat.copy_(start)
                 self.behind = behind
                 self.checkpoints.forget(begun)
                 self.work.rejected += 1
@@ -185,7 +194,7 @@ class Frames:
         if self.now_implicit and world.scheme == "auto":
             self.now_implicit, self.no_implicit = False, True
             self.problem.log.warn(f"frame {frame}: {why}; explicit from here on")
-            return self._frame(frame)
+            return self.onward(frame)
         dt, t = frame_dt / count, (frame - 1) * frame_dt
         if fixed:
             remedy = f"world.dt < {dt / 2:g}, or {remedy}"
@@ -201,7 +210,7 @@ class Frames:
         if world.scheme == "auto":
             if world.dt is not None:
                 return
-            now = self._now()
+            now = self.now
             limit = explicit_limit(world, self.body.coefficients, now, self.body.look(now))
             explicit = explicit_need(world, limit, frame_dt)
             if explicit < WORTH * implicit_need(world, now, frame_dt):
@@ -212,9 +221,9 @@ class Frames:
         self.now_implicit = True
         self.implicit = ImplicitSubsteps(self.substeps, bounded=bool(self.body.hooks.node or self.body.hooks.grip))
 
-    def _count(self, frame: int) -> int:
+    def count(self, frame: int) -> int:
         """Substeps of the coming frame. Raises ValueError as `substeps_of_frame` does."""
-        world, now = self.problem.world, self._now()
+        world, now = self.problem.world, self.now
         limit = explicit_limit(world, self.body.coefficients, now, self.body.look(now))
         self.remedy = limit.remedy
         last = self.counts[-1] if self.counts else 0
@@ -228,7 +237,7 @@ class Frames:
         dt = self.problem.frame_dt / count
         runs: list[Run] = []
         for done in range(count):
-            now = self._now()
+            now = self.now
             lowest, size = window(self.problem.world, self.body.look(now), steps=0, dt=dt, reach=0.0, frame=frame)
             self.arrays.set_window(lowest, size)
             clock = self._clock((frame - 1) * self.problem.frame_dt + done * dt, dt, 1, kick=self.behind + dt)
@@ -251,7 +260,7 @@ class Frames:
         runs: list[Run] = []
         done = 0
         while done < count:
-            now = self._now()
+            now = self.now
             # the limit follows the strain: look again before a particle has changed by a tenth, or snow that is packed
             # within a run bursts unseen
             rate = float(now.L.flatten(1).norm(dim=1).max())
@@ -280,7 +289,7 @@ class Frames:
 
     def _inspect(self, frame: int, dt: float, lost: int) -> None:
         """After a run: is every number finite, every particle in the region, and every substep short enough?"""
-        world, now = self.problem.world, self._now()
+        world, now = self.problem.world, self.now
         seen = self.body.look(now)
         if seen.infinite:
             bad = ~torch.isfinite(now.u.sum(1) + now.v.square().sum(1) + now.tau.square().sum((1, 2)))
@@ -328,7 +337,7 @@ class Frames:
         """The first particle of a mask [p]: its number as the caller counts, and where it is or was at rest."""
         p = int(chosen.nonzero()[0])
         rest = self.body.rest[p]
-        x = rest + self._now().u[p]
+        x = rest + self.now.u[p]
         what, x = ("at", x) if bool(torch.isfinite(x).all()) else ("at rest at", rest)
         place = ", ".join(f"{value:.4g}" for value in x.tolist())
         return f"particle {int(self.problem.order[p])} {what} ({place}) m"

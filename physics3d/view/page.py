@@ -29,6 +29,7 @@ IDLE = 0.05  # between looks at whether something is asked [s]
 HANDLES = 1500  # places to take hold of, at most
 WIDE = 320  # of the clip, at least [px]
 TURNED = 0.03  # of its distance, from which on a moved eye has new colours
+SLOW = 0.9  # of the clock: below it is said how fast time passes
 AHEAD = np.array([0.0, -1.0, 0.3])  # where the eye is that no camera was
 POKE = "Drag any part of the body. It is simulated as you pull; the camera turns when you drag beside it."
 
@@ -53,7 +54,6 @@ class Page:
         eye = camera.centre.numpy() if camera is not None else middle + 2 * SIZE / self.pictures.scale * AHEAD
         self.eye = eye.astype(float)
         self._drawn_from: tuple[Kind, np.ndarray] | None = None  # what the still background has the colours of
-        self._stressed_at = 0.0  # time of the last stress of the live body [s]
         self._grip = np.zeros(3)  # where the hand took hold [units]
         self._said = 0.0  # when the rate was said last [s]
         self._spent: deque[tuple[float, float, float, int, int]] = deque(maxlen=60)  # of frames, see `rate`
@@ -237,9 +237,8 @@ class Page:
         motion = self.run.trajectory
         if self.mode == "live" and self.live is not None:
             x, F, v = self.live.particles()
-            stress = self.live.stress.after(F, max(self.live.stepper.time - self._stressed_at, 1e-9))
-            self._stressed_at = self.live.stepper.time
-            return Moment(position=x, deformation=F, speed=np.linalg.norm(v.numpy(), axis=1), stress=stress)
+            speed = np.linalg.norm(v.numpy(), axis=1)
+            return Moment(position=x, deformation=F, speed=speed, stress=self.live.stress(F))
         return self.pictures.moment(min(int(self.time * motion.fps + 1e-6), len(motion.position) - 1))
 
     def _draw(self) -> tuple[int, int]:
@@ -252,7 +251,7 @@ class Page:
             _send(node, shown)
             self._moving.visible, self._particles.visible = not self._balls.value, self._balls.value
             self._background(kind)
-            at = now.position.double().numpy()[self._held_by] * scale
+            at = now.position.numpy()[self._held_by] * scale
             self._handles.batched_positions = at.astype(np.float32)
             self._follow_clip()
             self._clock.value = min(self.time, self._clock.max) if self.mode == "run" else self._clock.value
@@ -292,7 +291,7 @@ class Page:
             self.mode, self.time, self.play.value = "run", float(self._clock.value), False
         elif what == "poke":
             self.live = told[0]
-            self._told.content = POKE
+            self._told.content = self._invitation()
             for control in self._pokes:
                 control.disabled = False
         elif what == "no poke":
@@ -307,7 +306,7 @@ class Page:
             live.rest()
             self.mode = "live"
         elif what == "back":
-            self.mode, self.play.value, self._told.content = "run", True, POKE
+            self.mode, self.play.value, self._told.content = "run", True, self._invitation()
         elif what == "save":
             self._keep(live)
 
@@ -325,9 +324,11 @@ class Page:
             live.let_go()
 
     def _keep(self, live: Live) -> None:
-        notes: tuple[str, ...] = ()
+        notes = live.mover.notes
         if (live.stiffness, live.damping) != (1.0, self.run.world.damping):
-            notes = (f"poked at {live.stiffness:g} times the stiffness, and with world.damping={live.damping:g}",)
+            notes += (f"poked at {live.stiffness:g} times the stiffness, and with world.damping={live.damping:g}",)
+        if live.record is not None and live.record.begin > 0:
+            notes += (f"poked {live.record.begin:.2g} s after the body was at rest; here it is at the start",)
         try:
             impulses = live.record.impulses() if live.record is not None else ()
             if not impulses:
@@ -340,8 +341,16 @@ class Page:
         live = self.live
         assert live is not None
         force = float(np.linalg.norm(live.force))
-        line = f"Pulled with **{force:.2g} N**." if live.hold is not None else "Let go; " + POKE[0].lower() + POKE[1:]
-        return line + (f"\n\n*{live.trouble}.*" if live.trouble else "")
+        again = "Let go; " + POKE[0].lower() + POKE[1:]
+        lines = [f"Pulled with **{force:.2g} N**." if live.hold is not None else again]
+        lines += [f"*{live.trouble}.*"] if live.trouble else []
+        lines += [live.mover.how]
+        lines += [f"Time passes at **{live.pace:.2f}** of the clock."] if live.pace < SLOW else []
+        return "\n\n".join(lines)
+
+    def _invitation(self) -> str:
+        """What to do, before anybody has."""
+        return POKE if self.live is None else f"{POKE}\n\n{self.live.mover.how}"
 
     def _legend_of(self, kind: Kind) -> str:
         style = 'style="padding:0 1em;font-size:85%"'

@@ -6,7 +6,8 @@ rest, with the force
     F = d/c     [N]
 
 c [m/N] being how far this place gives way to a force at rest, before anything relaxes: the body follows the hand where
-it is linear, lags where it stiffens, and creeps further where it is viscous. What is kept is the force as it was, in a
+it is linear, lags where it stiffens, and creeps further where it is viscous (`by_modes.py`; a grid has another hand,
+`by_grid.py`). What is kept is the force as it was, in a
 few windows of time with the mean of each,
 
     impulse of a window = int F dt     exactly, in sum as well,
@@ -36,6 +37,7 @@ class Record:
     centre: tuple[float, float, float]  # at rest [m]
     radius: float  # [m]
     dt: float  # of a step [s]
+    begin: float = 0.0  # when the hand took hold, after the body was at rest [s]
     forces: list[Float[np.ndarray, "3"]] = field(default_factory=list)  # [N]
 
     def impulses(self) -> tuple[Impulse, ...]:

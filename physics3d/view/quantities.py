@@ -62,8 +62,13 @@ def stresses(material: AbstractMaterial, parameters: Values, trajectory: Traject
 
 def von_mises(P: Float[np.ndarray, "n 3 3"], F: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " n"]:
     """Of the first Piola-Kirchhoff stress P [Pa]: sigma = P F^T / det F. What is turned inside out has none."""
+    return von_mises_of_kirchhoff(np.einsum("nik,njk->nij", P, F), F)
+
+
+def von_mises_of_kirchhoff(tau: Float[np.ndarray, "n 3 3"], F: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " n"]:
+    """Of the Kirchhoff stress [Pa]: sigma = tau / det F. What is turned inside out has none."""
     J = np.linalg.det(F)
-    sigma = np.einsum("nik,njk->nij", P, F) / np.where(J > 0, J, np.inf)[:, None, None]
+    sigma = tau / np.where(J > 0, J, np.inf)[:, None, None]
     deviator = sigma - np.trace(sigma, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
     return np.sqrt(1.5 * np.einsum("nij,nij->n", deviator, deviator))
 

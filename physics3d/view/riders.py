@@ -23,16 +23,39 @@ FLAT = 1e-3  # volume ratio below which a Gaussian has no rotation of its own
 UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # of a symmetric matrix, in the order of 3DGS
 
 
+class Carried:
+    """Points at rest at `points` [g, 3] m that ride on particles at rest at X [p, 3] m; in float32."""
+
+    def __init__(self, embedding: Embedding, X: Float[Tensor, "p 3"], points: Float[Tensor, "g 3"]):
+        self.X = X.float().numpy()
+        g, k = embedding.neighbours.shape
+        rows = (embedding.weights.float().numpy().ravel(), embedding.neighbours.numpy().ravel(), np.arange(g + 1) * k)
+        self.weights = sparse.csr_matrix(rows, shape=(g, len(X)))
+        self._lever = (points.float().numpy() - 0.5 * (self.weights @ self.X)).T.copy()  # [3, g]
+
+    def __call__(
+        self, x: Float[Tensor, "p 3"], F: Float[Tensor, "p 3 3"]
+    ) -> tuple[Float[np.ndarray, "3 g"], Float[np.ndarray, "3 3 g"]]:
+        """Places [m] and deformations."""
+        x_, F_ = x.float().numpy(), F.float().numpy()
+        carried = np.empty((len(x_), 12), np.float32)
+        carried[:, :9] = F_.reshape(-1, 9)
+        carried[:, 9:] = x_ - 0.5 * np.einsum("pij,pj->pi", F_, self.X)
+        blended = np.ascontiguousarray((self.weights @ carried).T)  # [12, g]
+        G = blended[:9].reshape(3, 3, -1)
+        return blended[9:] + np.einsum("ijg,jg->ig", G, self._lever), G
+
+    def blend(self, value: Float[np.ndarray, "p *k"]) -> Float[np.ndarray, "g *k"]:
+        """Numbers of the particles, at the points."""
+        return self.weights @ value
+
+
 class Riders:
     """The Gaussians of an embedding and how they follow particles whose place at rest is X [p, 3] m; in float32."""
 
     def __init__(self, gaussians: Gaussians, embedding: Embedding, X: Float[Tensor, "p 3"]):
         mine = gaussians.select(embedding.which)
-        self.X = X.float().numpy()
-        g, k = embedding.neighbours.shape
-        rows = (embedding.weights.float().numpy().ravel(), embedding.neighbours.numpy().ravel(), np.arange(g + 1) * k)
-        self.weights = sparse.csr_matrix(rows, shape=(g, len(X)))
-        self._lever = (mine.mean.float().numpy() - 0.5 * (self.weights @ self.X)).T.copy()  # [3, g]
+        self._carried = Carried(embedding, X, mine.mean)
         # Sigma = L L^T at rest
         root = mine.rotation() * mine.log_scale.exp()[:, None, :]
         self._root = root.permute(1, 2, 0).contiguous().float().numpy()  # [3, 3, g]
@@ -42,20 +65,14 @@ class Riders:
         self, x: Float[Tensor, "p 3"], F: Float[Tensor, "p 3 3"]
     ) -> tuple[Float[np.ndarray, "g 3"], Float[np.ndarray, "g 6"], Float[np.ndarray, "3 3 g"] | None]:
         """Means [m], upper triangles of the covariances [m^2] and rotations, None where no colour needs them."""
-        x_, F_ = x.float().numpy(), F.float().numpy()
-        carried = np.empty((len(x_), 12), np.float32)
-        carried[:, :9] = F_.reshape(-1, 9)
-        carried[:, 9:] = x_ - 0.5 * np.einsum("pij,pj->pi", F_, self.X)
-        blended = np.ascontiguousarray((self.weights @ carried).T)  # [12, g]
-        G = blended[:9].reshape(3, 3, -1)
-        mean = blended[9:] + np.einsum("ijg,jg->ig", G, self._lever)
+        mean, G = self._carried(x, F)
         M = np.einsum("ikg,kjg->ijg", G, self._root)
         upper = np.stack([(M[i] * M[j]).sum(0) for i, j in UPPER], 1)
         return mean.T, upper, rotation(G) if self.turns else None
 
     def blend(self, value: Float[np.ndarray, " p"]) -> Float[np.ndarray, " g"]:
         """A number per particle, at the Gaussians."""
-        return self.weights @ value
+        return self._carried.blend(value)
 
 
 def rotation(F: Float[np.ndarray, "3 3 g"]) -> Float[np.ndarray, "3 3 g"]:

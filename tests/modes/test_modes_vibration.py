@@ -9,6 +9,8 @@ from modes_bodies import row, section, timoshenko, turned_beam, world
 
 from physics3d.boundaries.fixed_region import FixedRegion
 from physics3d.log import Log
+from physics3d.materials.mixture import PART, Mixture
+from physics3d.materials.neo_hookean import NeoHookean
 from physics3d.materials.viscoelastic import Viscoelastic
 from physics3d.modes.rollout import Solver
 
@@ -88,3 +90,21 @@ def test_frequency_and_loss_follow_the_complex_modulus():
     # the relaxation is sampled at 120 times; shapes are the same because both parts have one Poisson ratio
     assert mode.frequency == pytest.approx(elastic.frequency * math.sqrt(complex_modulus.real), rel=2e-3)
     assert mode.loss_factor == pytest.approx(complex_modulus.imag / complex_modulus.real, rel=1e-2)
+
+
+def test_a_held_body_names_its_slowest_swing_however_stiff_it_is_elsewhere():
+    """A stiff rod on a soft foot: k = E' I/foot turns it about the middle of the foot."""
+    count, edge, soft, hard, of_foot = 60, 0.006, 1e3, 1e9, 4
+    start = {f"{part}.{name}": value for part, young in (("foot", soft), ("rod", hard))
+             for name, value in (("youngs_modulus", young), ("poissons_ratio", 0.3))}  # fmt: skip
+    both = Mixture(materials={"foot": NeoHookean(), "rod": NeoHookean()})
+    part = torch.tensor([0] * of_foot + [1] * (count - of_foot))
+    solver = Solver.of(world(soft, 0.3, material=both, start=start), *row(count, edge), part=part, log=Log(None))
+    values = {name: torch.tensor(value) for name, value in start.items()} | {PART: part}
+    found = solver.modes(values)
+    foot, rod = of_foot * edge, (count - of_foot) * edge
+    inertia = 300.0 * edge**2 * rod * ((foot / 2 + rod / 2) ** 2 + rod**2 / 12)
+    theory = math.sqrt(soft * edge**4 / 12 / foot / inertia) / (2 * math.pi)
+    assert found[-1].frequency > 1e3 * found[0].frequency
+    # splines that reach from the foot into the rod are stiff: at most one of the foot's four particles is lost to them
+    assert theory < found[0].frequency < math.sqrt(4 / 3) * theory

@@ -5,6 +5,7 @@ import threading
 import time
 import urllib.error
 import urllib.request
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -62,6 +63,34 @@ def test_a_taken_port_is_refused(page):
         Page(page.run, host="127.0.0.1", port=page.server.get_port(), save=lambda i, n: "", log=Log(None))
 
 
+def test_a_poke_by_the_grid_says_so_and_how_it_differs_is_kept_with_it(monkeypatch):
+    monkeypatch.setattr("physics3d.view.by_grid.RATE", 1e3)
+    monkeypatch.setattr("physics3d.view.by_grid.CELLS", 4)
+    kept: list = []
+    free = replace(run(frames=1).world, boundaries=())
+    page = Page(
+        run(frames=2, world=free),
+        host="127.0.0.1",
+        port=free_port(),
+        save=lambda impulses, notes: kept.append(notes) or "kept",
+        log=Log(None),
+    )
+    try:
+        page.prepare()
+        page.turn(0.0)
+        assert "reduced size" in page._told.content and not page._save.disabled
+        page.live.advance(0.1)
+        page.live.grab(int(page.run.body.position[:, 2].argmax()))
+        page.live.pull(np.array([0.02, 0.0, 0.0]))
+        page.live.advance(0.1)
+        page.asked.put(("save",))
+        page.turn(0.0)
+        assert [note.split()[0] for note in kept[-1]] == ["poked", "poked"]
+        assert "cells of 100 mm" in kept[-1][0] and "after the body was at rest" in kept[-1][1]
+    finally:
+        page.server.stop()
+
+
 @pytest.mark.skipif(chromium() is None, reason="no chromium; on Debian: apt install chromium")
 def test_a_body_that_is_dragged_in_a_browser_follows_and_the_poke_is_kept(page, tmp_path):
     """Pressed at its top, drawn to the right and held there: it bends to the right, on the page and in numbers."""
@@ -84,7 +113,7 @@ def test_a_body_that_is_dragged_in_a_browser_follows_and_the_poke_is_kept(page, 
             time.sleep(0.1)
         tab.wait_for("Pulled with")
         end = time.monotonic() + 60
-        while (moved := page.live.stepper.particles()[0][:, 0] - page.run.body.position[:, 0]).max() < 0.04:
+        while (moved := page.live.mover.particles()[0][:, 0] - page.run.body.position[:, 0]).max() < 0.04:
             assert time.monotonic() < end, f"it moved by {moved.max():.3g} m"
             time.sleep(0.2)
         pulled = tab.picture()
