@@ -159,6 +159,7 @@ def swinging(
     f, d, r = roots(square, math.exp(material.ratio), math.exp(material.time))
     t = np.arange(len(clip.gram)) / clip.fps
     functions = time_functions(f, d, r, t)
+    size = functions**2 @ clip.weight
     if reference is not None:
         functions = functions - time_functions(f, d, r, np.array([reference]))
     G = np.einsum("mk,tmn,nl->tkl", shape, clip.gram, shape, optimize=True)
@@ -171,7 +172,6 @@ def swinging(
     n = 3 * len(f)
     space = np.einsum("mk,mn,nk->k", shape, body.weight, shape) * body.scale**2
     main = int(np.argmax((b**2).sum(0) / np.maximum(np.einsum("tkk->k", G), 1e-30)))
-    seen = float(clip.weight.sum())
     return Swinging(
         shape=shape,
         frequency=f,
@@ -181,7 +181,7 @@ def swinging(
         gram=G,
         normal=normal.reshape(n, n),
         right=np.einsum("akt,tk->ak", functions, b).reshape(n),
-        ridge=FAINT * np.tile(space * np.maximum(1, square / square[main]), 3) * seen,
+        ridge=FAINT * (size * space * np.maximum(1, square / square[main])).ravel(),
         square=float(square_sum.sum()),
     )
 

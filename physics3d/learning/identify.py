@@ -99,16 +99,17 @@ def identified(body: Reduced, clip: Observed, decay: Decay, *, reference: float 
     span = shape[:, :SPAN]
     space = np.einsum("mk,mn,nk->k", span, body.weight, span) * body.scale**2
     gram = np.einsum("mk,tmn,nl->tkl", span, clip.gram, span, optimize=True)
-    right, moved, seen = clip.right @ span, float(clip.square.sum()), float(clip.weight.sum())
+    right, moved = clip.right @ span, float(clip.square.sum())
     t = np.arange(len(gram)) / clip.fps
 
     def solved(f: np.ndarray, d: np.ndarray, slowing: float) -> tuple[np.ndarray, float, float]:
         """(cosine and sine of every oscillation [j, 2, k], what is left, with the cost of what is not seen)."""
-        F = _since(lambda t: oscillations(f, d, slowing, t), t, reference).reshape(-1, len(t))
+        functions = lambda t: oscillations(f, d, slowing, t)
+        F = _since(functions, t, reference).reshape(-1, len(t))
         n = len(F) * len(space)
         normal = np.einsum("at,tkl,bt->akbl", F, gram, F, optimize=True).reshape(n, n)
         b = np.einsum("at,tk->ak", F, right).reshape(n)
-        ridge = FAINT * seen * np.tile(space, len(F))
+        ridge = FAINT * np.kron(functions(t).reshape(-1, len(t)) ** 2 @ clip.weight, space)
         x = np.linalg.solve(normal + np.diag(ridge), b)
         left = moved - 2 * x @ b + x @ normal @ x
         return x.reshape(len(f), 2, -1), left / moved, (left + x @ (ridge * x)) / moved
@@ -175,11 +176,13 @@ def _start(
     count = len(F)
     basis = np.repeat(modes.shape, 2, 1)  # [m, 2 j], each times its function of time
     functions = F.reshape(2 * count, -1)
+    size = modes.functions(t, slowing).reshape(2 * count, -1) ** 2 @ clip.weight
     faint = np.full(2 * count, SEEN)
     b, square = clip.right, clip.square
     if known is not None:
         basis = np.hstack([basis, modes.span])
         functions = np.vstack([functions, np.ones((modes.span.shape[1], len(t)))])
+        size = np.concatenate([size, np.full(modes.span.shape[1], clip.weight.sum())])
         faint = np.concatenate([faint, np.full(modes.span.shape[1], FAINT)])
         b = b + clip.gram @ known  # u + J q is what the motion has to explain
         square = square + 2 * clip.right @ known + np.einsum("m,tmn,n->t", known, clip.gram, known)
@@ -187,7 +190,7 @@ def _start(
     normal = np.einsum("xt,txy,yt->xy", functions, gram, functions, optimize=True)
     right = np.einsum("xt,tx->x", functions, b @ basis)
     space = np.einsum("mx,mn,nx->x", basis, body.weight, basis) * body.scale**2
-    x = np.linalg.solve(normal + np.diag(faint * space * float(clip.weight.sum())), right)
+    x = np.linalg.solve(normal + np.diag(faint * space * size), right)
     left = float(square.sum() - 2 * x @ right + x @ normal @ x)
     return Swing(
         modes=modes,
