@@ -12,9 +12,10 @@ every mode has three roots s: an oscillation, and the creep of its dash-pot. The
 
 Against the flow (`seen_modes.py`) the a, b, c are linear least squares, solved inside for any material (variable
 projection, Golub and Pereyra 1973); a mode that a camera hardly sees is held near zero by a hundredth of what its
-motion in space would cost if it were seen, and more by as much as its energy is above that of the mode seen most. The
-material is sought from the frequency of the clip's largest oscillation (`motion/decay.py`), taken in turn for the modes
-whose shapes alone explain most of the motion: no guess of a person's is asked for.
+motion in space would cost if it were seen, and more by as much as its energy is above that of the mode seen most. That
+is its motion over the frames: an amplitude at time 0 is smaller the less damping is assumed, and its cost would choose
+the damping. The material is sought from the frequency of the clip's largest oscillation (`motion/decay.py`), taken in
+turn for the modes whose shapes alone explain most of the motion: no guess of a person's is asked for.
 
 One free motion tells stiffness over density, for the size that was given; zones are taken up only where the clip asks
 for them (a tenth of the unexplained motion less).
@@ -159,6 +160,7 @@ def swinging(
     f, d, r = roots(square, math.exp(material.ratio), math.exp(material.time))
     t = np.arange(len(clip.gram)) / clip.fps
     functions = time_functions(f, d, r, t)
+    size = functions**2 @ clip.weight  # of a motion over the frames, whichever of them the flow counts from
     if reference is not None:
         functions = functions - time_functions(f, d, r, np.array([reference]))
     G = np.einsum("mk,tmn,nl->tkl", shape, clip.gram, shape, optimize=True)
@@ -171,7 +173,6 @@ def swinging(
     n = 3 * len(f)
     space = np.einsum("mk,mn,nk->k", shape, body.weight, shape) * body.scale**2
     main = int(np.argmax((b**2).sum(0) / np.maximum(np.einsum("tkk->k", G), 1e-30)))
-    seen = float(clip.weight.sum())
     return Swinging(
         shape=shape,
         frequency=f,
@@ -181,7 +182,7 @@ def swinging(
         gram=G,
         normal=normal.reshape(n, n),
         right=np.einsum("akt,tk->ak", functions, b).reshape(n),
-        ridge=FAINT * np.tile(space * np.maximum(1, square / square[main]), 3) * seen,
+        ridge=FAINT * (size * space * np.maximum(1, square / square[main])).ravel(),
         square=float(square_sum.sum()),
     )
 

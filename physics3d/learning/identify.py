@@ -5,15 +5,17 @@ the thing, but together they still span its motion. So what is seen is taken apa
 are combinations of the first modes of the model (modal identification; Friswell and Mottershead 1995, Finite Element
 Model Updating in Structural Dynamics):
 
-    q(t) = q_0 + sum_j psi_j e^(-d_j t) (a_j cos p_j(t) + b_j sin p_j(t)),     p_j(t) = 2 pi f_j (t - k l(t))
-    l(t) = (1 - e^(-2 d t))/(2 d),     d that of the first oscillation
+    q(t) = q_0 + sum_j psi_j e^(-h_j(t)) (a_j cos p_j(t) + b_j sin p_j(t))
+    h_j(t) = d_j (t + g l(t)),     p_j(t) = 2 pi f_j (t - k l(t)),     l(t) = (1 - e^(-2 d t))/(2 d)
 
-f_j is the frequency of small swings. Large ones are slower, by the share k at time 0, and k is as the square of the
-amplitude: stems, cords and what holds them soften as they are strained. q_0 is where the thing comes to rest in a take
-whose picture at rest is another one's.
+with d that of the first oscillation. f_j and d_j are those of small swings. Large ones are slower, by the share k at
+time 0, and die out faster, by the share g, and both are as the square of the amplitude: stems, cords and what holds
+them soften and rub as they are strained, and this is what the first terms of any such law do to a swing (averaging;
+Nayfeh and Mook 1979, Nonlinear Oscillations). q_0 is where the thing comes to rest in a take whose picture at rest is
+another one's.
 
 Amplitudes and shapes are linear least squares inside (variable projection, Golub and Pereyra 1973), as in
-`free_motion.py`; f, d and k are refined from what `motion/decay.py` reads off. An oscillation is taken up if it leaves
+`free_motion.py`; f, d, k and g are refined from what `motion/decay.py` reads off. An oscillation is taken up if it leaves
 `ASKED` of the unexplained motion or less. Cosine and sine of each then share one shape, as those of a mode do, and
 another take of the same thing has its own a, b and q_0 alone.
 """
@@ -34,9 +36,10 @@ SPAN = 8  # modes of the model that shapes are made of
 MOST = 4  # oscillations
 ASKED = 0.7  # of the unexplained motion
 SEEN = 1e-4  # what FAINT is for shapes that were read off a clip
-WIDTH = {"slowing": 0.1, "frequency": 0.05, "damping": 1.0}  # of what is likely; the last two in the logarithm
+# of what is likely: k; g, for what softens by a tenth by rubbing has about as much damping again; and, in the logarithm
+WIDTH = {"slowing": 0.1, "loss": 1.0, "frequency": 0.05, "damping": 1.0}
 LEAST_DAMPING = 0.005  # that a refinement starts from, in 2 pi f
-MOST_SLOWING = 0.3
+MOST_WIDE = np.array([0.3, 3.0])  # k, g
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,12 +50,12 @@ class Oscillations:
     span: Float[np.ndarray, "m k"]  # the modes that the shapes are made of
     frequency: Float[np.ndarray, " j"]  # [Hz]
     damping: Float[np.ndarray, " j"]  # [1/s]
-    slowing: float  # k of a swing of the mean square `power`
+    wide: Float[np.ndarray, " 2"]  # k and g of a swing of the mean square `power`
     power: float  # [m^2]
 
-    def functions(self, t: Float[np.ndarray, " n"], slowing: float) -> Float[np.ndarray, "j 2 n"]:
-        """Cosine and sine of every oscillation at times t [s], for the `slowing` of one take."""
-        return oscillations(self.frequency, self.damping, slowing, t)
+    def functions(self, t: Float[np.ndarray, " n"], wide: Float[np.ndarray, " 2"]) -> Float[np.ndarray, "j 2 n"]:
+        """Cosine and sine of every oscillation at times t [s], for k and g of one take."""
+        return oscillations(self.frequency, self.damping, wide, t)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,12 +65,12 @@ class Swing:
     modes: Oscillations
     amplitude: Float[np.ndarray, "j 2"]  # a_j, b_j
     rest: Float[np.ndarray, " m"]  # q_0 [m]
-    slowing: float
+    wide: Float[np.ndarray, " 2"]  # k, g
     unexplained: float  # share of the motion
 
     def at(self, t: float) -> Float[np.ndarray, " m"]:
         """Amplitudes of the basis at time t [s]."""
-        f = self.modes.functions(np.array([t]), self.slowing)[..., 0]
+        f = self.modes.functions(np.array([t]), self.wide)[..., 0]
         return self.rest + self.modes.shape @ (self.amplitude * f).sum(1)
 
     def loudest(self, t: float) -> int:
@@ -81,12 +84,13 @@ class Swing:
 
 
 def oscillations(
-    f: Float[np.ndarray, " j"], d: Float[np.ndarray, " j"], slowing: float, t: Float[np.ndarray, " n"]
+    f: Float[np.ndarray, " j"], d: Float[np.ndarray, " j"], wide: Float[np.ndarray, " 2"], t: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "j 2 n"]:
-    """e^(-d t) cos p and e^(-d t) sin p of every oscillation."""
-    twice = max(2 * float(d[0]), 1e-6)
-    phase = 2 * np.pi * f[:, None] * (t - slowing * (1 - np.exp(-twice * t)) / twice)
-    return np.exp(-d[:, None] * t)[:, None] * np.stack([np.cos(phase), np.sin(phase)], 1)
+    """e^(-h) cos p and e^(-h) sin p of every oscillation."""
+    twice, (slower, sooner) = max(2 * float(d[0]), 1e-6), wide
+    late = (1 - np.exp(-twice * t)) / twice
+    phase = 2 * np.pi * f[:, None] * (t - slower * late)
+    return np.exp(-d[:, None] * (t + sooner * late))[:, None] * np.stack([np.cos(phase), np.sin(phase)], 1)
 
 
 def identified(body: Reduced, clip: Observed, decay: Decay, *, reference: float | None, log: Log) -> Swing:
@@ -99,16 +103,17 @@ def identified(body: Reduced, clip: Observed, decay: Decay, *, reference: float 
     span = shape[:, :SPAN]
     space = np.einsum("mk,mn,nk->k", span, body.weight, span) * body.scale**2
     gram = np.einsum("mk,tmn,nl->tkl", span, clip.gram, span, optimize=True)
-    right, moved, seen = clip.right @ span, float(clip.square.sum()), float(clip.weight.sum())
+    right, moved = clip.right @ span, float(clip.square.sum())
     t = np.arange(len(gram)) / clip.fps
 
-    def solved(f: np.ndarray, d: np.ndarray, slowing: float) -> tuple[np.ndarray, float, float]:
+    def solved(f: np.ndarray, d: np.ndarray, wide: np.ndarray) -> tuple[np.ndarray, float, float]:
         """(cosine and sine of every oscillation [j, 2, k], what is left, with the cost of what is not seen)."""
-        F = _since(lambda t: oscillations(f, d, slowing, t), t, reference).reshape(-1, len(t))
+        functions = lambda t: oscillations(f, d, wide, t)
+        F = _since(functions, t, reference).reshape(-1, len(t))
         n = len(F) * len(space)
         normal = np.einsum("at,tkl,bt->akbl", F, gram, F, optimize=True).reshape(n, n)
         b = np.einsum("at,tk->ak", F, right).reshape(n)
-        ridge = FAINT * seen * np.tile(space, len(F))
+        ridge = FAINT * np.kron(functions(t).reshape(-1, len(t)) ** 2 @ clip.weight, space)
         x = np.linalg.solve(normal + np.diag(ridge), b)
         left = moved - 2 * x @ b + x @ normal @ x
         return x.reshape(len(f), 2, -1), left / moved, (left + x @ (ridge * x)) / moved
@@ -116,19 +121,18 @@ def identified(body: Reduced, clip: Observed, decay: Decay, *, reference: float 
     def cost(theta: np.ndarray, poles: np.ndarray) -> float:
         if np.abs(theta).max() > 5:
             return 1e3
-        k, by_f, by_d = theta[0], theta[1::2], theta[2::2]
-        unlikely = (k / WIDTH["slowing"]) ** 2
+        wide, by_f, by_d = theta[:2], theta[2::2], theta[3::2]
+        unlikely = float((wide[0] / WIDTH["slowing"]) ** 2 + (wide[1] / WIDTH["loss"]) ** 2)
         unlikely += float(((by_f / WIDTH["frequency"]) ** 2 + (by_d / WIDTH["damping"]) ** 2).sum())
-        return solved(poles[:, 0] * np.exp(by_f), poles[:, 1] * np.exp(by_d), k)[2] + PRIOR * unlikely
+        return solved(poles[:, 0] * np.exp(by_f), poles[:, 1] * np.exp(by_d), wide)[2] + PRIOR * unlikely
 
     swings = np.flatnonzero(decay.frequency > 0)
     swings = swings[np.argsort(-decay.amplitude(decay.end)[swings])]
     least = LEAST_DAMPING * 2 * np.pi * decay.frequency
     candidates = [np.array([decay.frequency[j], max(decay.damping[j], least[j])]) for j in swings]
-    poles, slowing, best = np.zeros((0, 2)), 0.0, 1.0
+    poles, wide, best = np.zeros((0, 2)), np.zeros(2), 1.0
     while candidates and len(poles) < MOST:
-        theta = np.zeros(3 + 2 * len(poles))
-        theta[0] = slowing
+        theta = np.concatenate([wide, np.zeros(2 + 2 * len(poles))])
         at = int(np.argmin([cost(theta, np.vstack([poles, c])) for c in candidates]))
         tried = np.vstack([poles, candidates.pop(at)])
         found = optimize.minimize(
@@ -136,15 +140,15 @@ def identified(body: Reduced, clip: Observed, decay: Decay, *, reference: float 
         )
         if len(poles) and found.fun > ASKED * best:
             continue
-        slowing, best = float(np.clip(found.x[0], -MOST_SLOWING, MOST_SLOWING)), found.fun
-        poles = tried * np.exp(np.stack([found.x[1::2], found.x[2::2]], 1))
+        wide, best = np.clip(found.x[:2], -MOST_WIDE, MOST_WIDE), found.fun
+        poles = tried * np.exp(np.stack([found.x[2::2], found.x[3::2]], 1))
     f, d = poles.T
-    both = solved(f, d, slowing)[0] * np.sqrt(space)
+    both = solved(f, d, wide)[0] * np.sqrt(space)
     one = np.stack([np.linalg.svd(pair)[2][0] for pair in both]) / np.sqrt(space)
-    modes = Oscillations(shape=span @ one.T, span=span, frequency=f, damping=d, slowing=slowing, power=1.0)
-    swing = _start(body, clip, modes, slowing, known=None, reference=reference)
+    modes = Oscillations(shape=span @ one.T, span=span, frequency=f, damping=d, wide=wide, power=1.0)
+    swing = _start(body, clip, modes, wide, known=None, reference=reference)
     named = ", ".join(f"{a:.3g} Hz (damping {b:.2g} 1/s)" for a, b in poles)
-    log.info(f"oscillations seen: {named}; large swings are {100 * slowing:.1f} % slower at first")
+    log.info(f"oscillations seen: {named}; at first swings are {100 * wide[0]:.1f} % slower and die out {100 * wide[1]:.0f} % faster")
     log.info(f"they explain {100 * (1 - swing.unexplained):.1f} % of the motion that is seen")
     return replace(swing, modes=replace(modes, power=_power(body, swing)))
 
@@ -153,33 +157,35 @@ def another_take(body: Reduced, clip: Observed, modes: Oscillations, known: Floa
     """The start, and the place of rest, of another take of the same thing, free from its first frame on.
 
     The flow counts from a picture in which the body has the amplitudes `known`; None: from its picture at rest."""
-    slowing = modes.slowing
+    wide = modes.wide
     for _ in range(4):  # amplitude and frequency hang on each other, weakly
-        swing = _start(body, clip, modes, slowing, known=np.zeros(len(modes.shape)) if known is None else known)
-        slowing = float(np.clip(modes.slowing * _power(body, swing) / modes.power, -MOST_SLOWING, MOST_SLOWING))
-    return replace(swing, slowing=slowing)
+        swing = _start(body, clip, modes, wide, known=np.zeros(len(modes.shape)) if known is None else known)
+        wide = modes.wide * min(1.0, _power(body, swing) / modes.power)  # nothing wider was seen
+    return replace(swing, wide=wide)
 
 
 def _start(
     body: Reduced,
     clip: Observed,
     modes: Oscillations,
-    slowing: float,
+    wide: Float[np.ndarray, " 2"],
     *,
     known: Float[np.ndarray, " m"] | None,
     reference: float | None = None,
 ) -> Swing:
     """Least squares for a, b, and q_0 where the flow counts from a picture of another take (`known`)."""
     t = np.arange(len(clip.gram)) / clip.fps
-    F = _since(lambda t: modes.functions(t, slowing), t, reference)
+    F = _since(lambda t: modes.functions(t, wide), t, reference)
     count = len(F)
     basis = np.repeat(modes.shape, 2, 1)  # [m, 2 j], each times its function of time
     functions = F.reshape(2 * count, -1)
+    size = modes.functions(t, wide).reshape(2 * count, -1) ** 2 @ clip.weight
     faint = np.full(2 * count, SEEN)
     b, square = clip.right, clip.square
     if known is not None:
         basis = np.hstack([basis, modes.span])
         functions = np.vstack([functions, np.ones((modes.span.shape[1], len(t)))])
+        size = np.concatenate([size, np.full(modes.span.shape[1], clip.weight.sum())])
         faint = np.concatenate([faint, np.full(modes.span.shape[1], FAINT)])
         b = b + clip.gram @ known  # u + J q is what the motion has to explain
         square = square + 2 * clip.right @ known + np.einsum("m,tmn,n->t", known, clip.gram, known)
@@ -187,13 +193,13 @@ def _start(
     normal = np.einsum("xt,txy,yt->xy", functions, gram, functions, optimize=True)
     right = np.einsum("xt,tx->x", functions, b @ basis)
     space = np.einsum("mx,mn,nx->x", basis, body.weight, basis) * body.scale**2
-    x = np.linalg.solve(normal + np.diag(faint * space * float(clip.weight.sum())), right)
+    x = np.linalg.solve(normal + np.diag(faint * space * size), right)
     left = float(square.sum() - 2 * x @ right + x @ normal @ x)
     return Swing(
         modes=modes,
         amplitude=x[: 2 * count].reshape(count, 2),
         rest=basis[:, 2 * count :] @ x[2 * count :],
-        slowing=slowing,
+        wide=wide,
         unexplained=left / max(float(square.sum()), 1e-30),
     )
 

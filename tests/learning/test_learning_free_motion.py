@@ -1,6 +1,7 @@
 """Free motion of unknown cause: roots, start and material against motions that were integrated in time."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -79,18 +80,21 @@ def filmed(body, truth, rng, *, frames=75, noise=0.02, memory=0.0):
     ), (q, seen)
 
 
+@pytest.mark.parametrize("shows", [1.0, 0.5])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_stiffness_and_damping_come_back_without_a_guess(seed):
+def test_stiffness_and_damping_come_back_without_a_guess(seed, shows):
+    """However much of the motion shows: what does not costs the same whatever the damping, so that none is preferred."""
     rng = np.random.default_rng(seed)
     body = chain(zones=1)
     truth = Material(stiffness=math.log(7.0), zones=np.zeros(1), ratio=math.log(0.4), time=math.log(0.06))
     clip, (q, _) = filmed(body, truth, rng)
+    body = replace(body, scale=5.0 / shows)  # pixels per metre of one who saw all
     f, d, _ = roots(modal(body, truth)[0], 0.4, 0.06)
     _, motion = fit(body, clip, release=0, reference=len(clip.gram) - 1, frequency=1.1 * f[0], log=Log(None))
     assert motion.frequency[0] == pytest.approx(f[0], rel=0.01)
     assert motion.damping[0] == pytest.approx(d[0], rel=0.1)
-    # the start, which nobody told: displacement at the first frame
-    assert np.linalg.norm(motion.at(0.0) - q[0]) < 0.05 * np.linalg.norm(q[0])
+    # the start, which nobody told: displacement at the first frame, where nothing is hidden
+    assert shows < 1 or np.linalg.norm(motion.at(0.0) - q[0]) < 0.05 * np.linalg.norm(q[0])
 
 
 def test_zones_are_taken_where_the_clip_asks_for_them(rng):

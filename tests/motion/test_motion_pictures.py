@@ -57,6 +57,25 @@ def test_a_carried_picture_is_the_picture_taken_at_displaced_places():
     assert np.abs(v + back)[inner].max() < 0.02
 
 
+@pytest.mark.parametrize("shift", [7, 40])
+def test_a_thing_arrives_however_far_it_moves(shift):
+    """A thin strip, ten pixels wide, before a ground that stands; beside it the motion ends within two pixels."""
+    y, x = np.mgrid[:H, :W].astype(float)
+    picture = np.repeat((100 * texture(x, y, 3) + 0.5)[..., None], 3, 2).astype(np.uint8)
+    strip = np.s_[20:80, 30:40]
+    picture[strip] += 150
+    u = np.zeros((H, W, 2), np.float32)
+    u[18:82, 28:42, 0] = shift
+    found = carried(picture, u)
+    arrived = np.s_[20:80, 30 + shift : 40 + shift]
+    assert (found[arrived] == picture[strip]).all()
+    bright = found[..., 0] > 110  # no ground is: what the strip has left shows ground, and no second strip
+    bright[arrived] = False
+    assert not bright.any()
+    beyond = np.s_[:, 44 + shift :]
+    assert (found[beyond] == picture[beyond]).all()
+
+
 def test_nothing_carried_is_the_picture_itself():
     picture = swaying(np.zeros(1))[0].numpy()
     assert (carried(picture, np.zeros((H, W, 2), np.float32)) == picture).all()
