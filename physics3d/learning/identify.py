@@ -15,9 +15,10 @@ Nayfeh and Mook 1979, Nonlinear Oscillations). q_0 is where the thing comes to r
 another one's.
 
 Amplitudes and shapes are linear least squares inside (variable projection, Golub and Pereyra 1973), as in
-`free_motion.py`; f, d, k and g are refined from what `motion/decay.py` reads off. An oscillation is taken up if it leaves
-`ASKED` of the unexplained motion or less. Cosine and sine of each then share one shape, as those of a mode do, and
-another take of the same thing has its own a, b and q_0 alone.
+`free_motion.py`; f, d, k and g are refined from what `motion/decay.py` reads off. An oscillation is taken up if it
+leaves `ASKED` of the unexplained motion or less. Cosine and sine of each then share one shape, as those of a mode do,
+and another take of the same thing has its own a, b and q_0 alone. Nothing wider than the first take is known: a wider
+one has its k and g.
 """
 
 from collections.abc import Callable
@@ -148,7 +149,8 @@ def identified(body: Reduced, clip: Observed, decay: Decay, *, reference: float 
     modes = Oscillations(shape=span @ one.T, span=span, frequency=f, damping=d, wide=wide, power=1.0)
     swing = _start(body, clip, modes, wide, known=None, reference=reference)
     named = ", ".join(f"{a:.3g} Hz (damping {b:.2g} 1/s)" for a, b in poles)
-    log.info(f"oscillations seen: {named}; at first swings are {100 * wide[0]:.1f} % slower and die out {100 * wide[1]:.0f} % faster")
+    slower, sooner = 100 * wide
+    log.info(f"oscillations seen: {named}; at first they are {slower:.1f} % slower and die out {sooner:.0f} % faster")
     log.info(f"they explain {100 * (1 - swing.unexplained):.1f} % of the motion that is seen")
     return replace(swing, modes=replace(modes, power=_power(body, swing)))
 

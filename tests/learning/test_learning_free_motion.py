@@ -83,7 +83,7 @@ def filmed(body, truth, rng, *, frames=75, noise=0.02, memory=0.0):
 @pytest.mark.parametrize("shows", [1.0, 0.5])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_stiffness_and_damping_come_back_without_a_guess(seed, shows):
-    """However much of the motion shows: what does not costs the same whatever the damping, so that none is preferred."""
+    """However much of the motion shows: the rest costs the same whatever the damping, so that none is preferred."""
     rng = np.random.default_rng(seed)
     body = chain(zones=1)
     truth = Material(stiffness=math.log(7.0), zones=np.zeros(1), ratio=math.log(0.4), time=math.log(0.06))
