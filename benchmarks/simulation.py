@@ -1,6 +1,7 @@
 """Error against run time of the simulator, on every problem whose answer is known.
 
-    make bench-simulation [ARGS="problems=vortex,column"]   ->   docs/results/simulation.csv, .png, .md
+    make bench-simulation   ->   docs/results/simulation.csv, .png, .md
+    make bench-simulation ARGS="problems=vortex,column"   measures these again and keeps the other rows
 
 The problems are in benchmarks/known_answers.py, each with its equation and source; `cells` is the number of grid cells
 along the length that matters. Explicit runs take automatic substeps (cfl), implicit ones a fixed multiple of the
@@ -72,6 +73,7 @@ def main(words: list[str]) -> None:
     options = dict(word.split("=", 1) for word in words)
     chosen = options["problems"].split(",") if "problems" in options else [*CELLS, "shear start-up"]
     torch.set_num_threads(1)
+    kept = [row for row in read() if row["problem"] not in chosen]
     rows: list[dict] = []
     for problem in [name for name in CELLS if name in chosen]:
         for precision in PRECISIONS:
@@ -96,8 +98,10 @@ def main(words: list[str]) -> None:
                         run, problem="shear start-up", precision=precision, size=f"{steps} steps", step="exponential"
                     )
                 )
+    order = [*CELLS, "shear start-up"]
+    rows = sorted([*kept, *rows], key=lambda row: order.index(row["problem"]))
     mark_front(rows)
-    write(rows)
+    write(rows, sorted({row["problem"] for row in kept}, key=order.index))
 
 
 def settings(problem: str) -> list[tuple[str, Callable[[int], dict]]]:
@@ -176,7 +180,27 @@ def mark_front(rows: list[dict]) -> None:
         row["pareto"] = row["outcome"] == "ran" and not beaten
 
 
-def write(rows: list[dict]) -> None:
+def read() -> list[dict]:
+    """The rows of the table that is there."""
+    table = RESULTS / "simulation.csv"
+    if not table.exists():
+        return []
+    with table.open(newline="") as file:
+        rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
+    number = lambda text, kind, none: kind(text) if text else none
+    return [
+        row
+        | dict(
+            substeps=number(row["substeps"], int, 0),
+            error=number(row["error"], float, math.nan),
+            seconds=number(row["seconds"], float, math.nan),
+        )
+        for row in rows
+    ]
+
+
+def write(rows: list[dict], kept: list[str]) -> None:
+    """`kept`: problems whose rows are of an earlier run."""
     RESULTS.mkdir(parents=True, exist_ok=True)
     columns = ("problem", "precision", "size", "step", "outcome", "substeps", "error", "seconds", "pareto", "reason")
     title = f"{machine('cpu')}, 1 thread"
@@ -186,7 +210,7 @@ def write(rows: list[dict]) -> None:
         table.writeheader()
         table.writerows(rows)
     draw(rows, title)
-    (RESULTS / "simulation.md").write_text(page(rows, title))
+    (RESULTS / "simulation.md").write_text(page(rows, title, kept))
 
 
 def draw(rows: list[dict], title: str) -> None:
@@ -239,9 +263,11 @@ def draw(rows: list[dict], title: str) -> None:
     figure.savefig(RESULTS / "simulation.png", dpi=100)
 
 
-def page(rows: list[dict], title: str) -> str:
+def page(rows: list[dict], title: str, kept: list[str]) -> str:
     """The results as a page. What it says of them is computed from them."""
     lines = ["# Simulation: error against run time", "", "Made by `make bench-simulation`. No random numbers.", ""]
+    if kept:
+        lines += [f"Of an earlier run, perhaps of another machine: {', '.join(kept)}.", ""]
     lines += [f"Machine: {title}. Shared with other work: compare times within this page only.", ""]
     lines += [*__doc__.split("\n\n", 2)[2].strip().splitlines(), "", "![error against time](simulation.png)", ""]
     lines += ["Numbers beside points are cells.", "", "## What it shows", ""]
@@ -316,6 +342,14 @@ def findings(rows: list[dict]) -> list[str]:
             f"The constitutive step alone is of order {order:.2f}, {many['error']:.1e} at 128 steps; the "
             "known answer has six digits, which is the floor of the last points."
         )
+    for problem in MODES:
+        for r in line_of(rows, problem, "modes", "float64")[-1:]:
+            grid = min(line_of(rows, problem, "cfl 0.5", "float64"), key=lambda g: g["error"], default=None)
+            if grid:
+                sentences.append(
+                    f"{problem}, without a grid: error {r['error']:.1e} in {r['seconds']:.2g} s; the best of the grid, "
+                    f"{grid['size']}, {grid['error']:.1e} in {grid['seconds']:.2g} s."
+                )
     refused = sum(r["outcome"] == "refused" for r in rows)
     failed = sum(r["outcome"] == "FAILED" for r in rows)
     sentences.append(f"{refused} runs were refused with a reason, {failed} failed.")

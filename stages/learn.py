@@ -272,13 +272,16 @@ class Learn:
             places = across(field, theta, angular_frequency(chain.simulate(theta)))
         if not places:
             return theta, points
-        there = min(places, key=lambda place: chain.measure(place, self.seed))
+        there = places[0] if len(places) == 1 else min(places, key=lambda place: chain.measure(place, self.seed))
         time = lambda at: physical(field, at)["shear_relaxation_time"]
         log.info(f"a relaxation time of {time(there):.3g} s damps the swing as {time(theta):.3g} s do: tried as well")
         other, more = self.polished(chain, field, there, log)
-        ends = [Point(way="across", theta=at, loss=chain.measure(at, self.seed)) for at in (theta, other)]
         if float((other - theta).abs().max()) < SAME:
             return theta, points
+        ends = [
+            Point(way="across", theta=at, loss=way[-1].loss if way else chain.measure(at, self.seed))
+            for at, way in ((theta, points), (other, more))
+        ]
         worse, better = sorted(ends, key=lambda end: end.loss, reverse=True)
         log.info(f"{time(better.theta):.3g} s explain the clip better: loss {better.loss:.5g}, not {worse.loss:.5g}")
         return better.theta, [*points, *more, worse, replace(better, way="polish")]
