@@ -43,6 +43,7 @@ MOST_FINER = 4  # times, in a frame
 # the phase of a large swing, or with the length of a step. More is tried with steps of half the length, so many times
 GAIN = 0.1
 ENERGY_TRIES = 4
+ROUNDING = 1e-13  # of the energy of a strain of one: what is less is rounding, of strains below 3e-7
 REMEDY = "take a weaker force, a slower start, a smaller world.dt or world.solver='grid'"
 FAR = 1.4  # stretched by more, a body is beyond what the basis was compared in
 TRIES = 6
@@ -276,8 +277,10 @@ class _Run:
         x, w, work = (np.array(one) for one in zip(*(seen[-1] for seen in self.seen), strict=True))
         memory = np.array([seen[2] for seen in self.seen])
         energy = 0.5 * np.einsum("tri,rs,tsi->t", w, self.system.mass, w) + self.system.stored(x, memory)
-        surplus = energy - work
-        share = (surplus - np.minimum.accumulate(surplus)) / np.maximum(np.maximum.accumulate(energy), 1e-300)
+        surplus, peak = energy - work, np.maximum.accumulate(energy)
+        modulus = self.solver.world.material.wave_modulus(torch.from_numpy(self.coefficients)).numpy()
+        rounding = ROUNDING * float(self.system.points.data["weight"] @ modulus)
+        share = (surplus - np.minimum.accumulate(surplus)) / np.maximum(peak, rounding)
         return float(share.max()), int(share.argmax())
 
     def backward(self, q_bar: np.ndarray, loads: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -80,6 +80,18 @@ def test_a_motion_that_gains_energy_is_refused():
                 solver.rollout(solver.world.start, **timing)
 
 
+@pytest.mark.parametrize("speed", [1e-6, 1e-10, 1e-30])
+def test_a_motion_below_rounding_is_no_gain_of_energy(speed):
+    """What is small swings as what is large, in single precision too."""
+    solver, velocity = thrown(speed=speed, precision="float32")
+    period = 2 * math.pi / float(solver.model.omega[0])
+    with torch.no_grad():
+        motion = solver.rollout(solver.world.start, velocity=velocity, frames=9, frame_dt=period / 8, log=Log(None))
+    end = motion.velocity[:, -1, 2].double().numpy() / speed
+    # back and forth once; other modes have a few per cent of the speed of the end
+    np.testing.assert_allclose(end, np.cos(2 * math.pi * np.arange(9) / 8), atol=0.15)
+
+
 def thrown(*, speed: float, steps: int | None = None, **changes) -> tuple[Solver, torch.Tensor]:
     """A beam of the cases and the velocity of its first mode, that fast at the end [m/s]."""
     position, volume = row(COUNT, EDGE)
