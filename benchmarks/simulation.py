@@ -222,7 +222,7 @@ def draw(rows: list[dict], title: str) -> None:
     down = math.ceil(len(problems) / across)
     figure = Figure(figsize=(4.2 * across, 3.4 * down + 0.8), layout="constrained")
     figure.suptitle(title, fontsize=9)
-    axes = figure.subplots(down, across, squeeze=False).flat
+    axes = list(figure.subplots(down, across, squeeze=False).flat)
     for axis, problem in zip(axes, problems):
         mine = [r for r in rows if r["problem"] == problem]
         ran = [r for r in mine if r["outcome"] == "ran"]
@@ -234,7 +234,7 @@ def draw(rows: list[dict], title: str) -> None:
                 axis.plot(x, y, "o-", color=f"C{i}", linewidth=0.7, markersize=4, fillstyle=filled)
         front = sorted((r["seconds"], max(r["error"], floor)) for r in mine if r["pareto"])
         if front:
-            axis.plot(*zip(*front, strict=True), "k-", linewidth=3, alpha=0.25, zorder=0)
+            axis.plot(*zip(*front, strict=True), "ko-", linewidth=3, markersize=9, alpha=0.25, zorder=0)
         without = [r for r in mine if r["outcome"] != "ran"]
         for i, r in enumerate(without):
             place = ((i + 1) / (len(without) + 1), 0.96)
@@ -248,7 +248,7 @@ def draw(rows: list[dict], title: str) -> None:
         axis.grid(which="major", alpha=0.2)
         axis.tick_params(labelsize=7)
         axis.title.set_size(9)
-    for axis in list(axes)[len(problems) :]:
+    for axis in axes[len(problems) :]:
         axis.set_axis_off()
     figure.supxlabel("wall clock [s]", fontsize=9)
     figure.supylabel("relative error", fontsize=9)
