@@ -2,6 +2,8 @@
 
 import dataclasses
 import math
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -515,3 +517,28 @@ def test_mesh_that_cannot_be_used_is_refused_with_the_remedy():
     hole = cube()
     with pytest.raises(ValueError, match=r"3 of 18 edges.*without holes"):
         MeshCollider(vertices=hole["vertices"], triangles=hole["triangles"][1:]).check()
+
+
+MEETS_A_MESH = """
+import torch
+from physics3d.boundaries.mesh_collider import MeshCollider
+from physics3d.log import Log
+from physics3d.materials.neo_hookean import NeoHookean
+from physics3d.mpm.rollout import rollout
+from physics3d.world import World
+
+vertices = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
+mesh = MeshCollider(vertices=vertices, triangles=[[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+start = dict(youngs_modulus=1e3, poissons_ratio=0.3)
+world = World(material=NeoHookean(), density=1e3, start=start, dx=0.1, boundaries=(mesh,))
+parameters = {name: torch.tensor(value) for name, value in start.items()}
+position, volume = torch.tensor([[0.5, 0.5, 1.5]]), torch.tensor([1e-4])
+rollout(world, parameters, position, volume, frames=2, frame_dt=1e-3, log=Log(None))
+"""
+
+
+def test_a_process_that_met_a_mesh_ends_well():
+    """Open3D lets a process fail that ends while its own memory is in use, such as samples of a distance that the
+    kernels' module keeps."""
+    ended = subprocess.run([sys.executable, "-c", MEETS_A_MESH], capture_output=True, text=True)
+    assert ended.returncode == 0, ended.stdout + ended.stderr
