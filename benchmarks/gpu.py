@@ -3,9 +3,9 @@
     make bench-gpu [ARGS="device=cuda seed=0"]   ->   docs/results/gpu.md, .csv, .png
 
 It needs torch, Warp, numpy, scipy, matplotlib, jaxtyping and annotated-types: no network, Prefect, Open3D, MLflow or
-ffmpeg, and no `make setup` where a Python has these (`make bench-gpu PYTHON=python3`). `device=cpu size=tiny out=<folder>` runs all of it small, to
-test the script. It ends with an error if the device does not agree with the CPU, or if rows of the table contradict each
-other (`slopes.py`): then nothing is written.
+ffmpeg, and no `make setup` where a Python has these (`make bench-gpu PYTHON=python3`). `device=cpu size=tiny
+out=<folder>` runs all of it small, to test the script. It ends with an error if the device does not agree with the CPU,
+or if rows of the table contradict each other (`slopes.py`): then nothing is written.
 
 Agreement is that of the same motion, picture and gradient computed on the device and on the CPU, in double precision
 where there is a choice; the solver without a grid computes on the CPU whatever the device is, and has to hand over the
@@ -179,7 +179,7 @@ def differs(what: str, compute: Callable[[str], list[torch.Tensor]], device: str
 
 def disagreements(rows: list[Row]) -> list[str]:
     return [
-        f"{r['what']}: the device differs from the CPU by {r['value']:.2g} of the greatest number, {r['spread']:.0e} allowed"
+        f"{r['what']}: the device differs from the CPU by {r['value']:.2g}, {r['spread']:.0e} is allowed"
         for r in rows
         if r["unit"] == "relative difference" and not r["value"] <= r["spread"]
     ]

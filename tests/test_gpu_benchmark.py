@@ -1,4 +1,4 @@
-"""`make bench-gpu` on the CPU, small: it runs without what it says it does not need, and writes nothing that is wrong."""
+"""`make bench-gpu` on the CPU, small: it runs without what it says it does not need, and writes no lies."""
 
 import subprocess
 import sys
