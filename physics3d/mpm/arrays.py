@@ -99,6 +99,8 @@ class Arrays:
         # the grid
         self._touch_count: int = len(hooks.touch)
         self.window: wp.array = self.zeros(6, wp.int32)  # lowest node and number of nodes along each axis
+        self.lowest: tuple[int, ...] = (0, 0, 0)  # the same for the host
+        self.size: tuple[int, ...] = (0, 0, 0)
         self.node_count: int = 0  # in the window
         self.capacity: int = 0  # nodes that the grid has room for; another one: the arrays below are others
         # what is added up there, in double precision on a CPU: the sums of many would drift in single precision
@@ -129,6 +131,7 @@ class Arrays:
     def set_window(self, lowest: Sequence[int], size: Sequence[int]) -> None:
         """Lay the grid over nodes lowest .. lowest + size - 1."""
         self.window.assign(np.array([*lowest, *size], np.int32))
+        self.lowest, self.size = tuple(lowest), tuple(size)
         self.node_count = int(np.prod(size))
         if self.node_count > self.capacity:
             self.capacity = int(1.5 * self.node_count) + 1  # one more: see `columns`

@@ -17,11 +17,13 @@ from torch import Tensor
 
 from physics3d.mpm.implicit.constraints import Constraints
 from physics3d.mpm.implicit.krylov import bicgstab, conjugate_gradients
+from physics3d.mpm.implicit.slow import Course, SlowModes
 from physics3d.mpm.implicit.system import System, dot
 from physics3d.mpm.implicit.tangent import Tangent
 
 ITERATIONS = 30
 TRIES = 10  # of one line search
+SERVES = 0.1  # a tangent that left the residual smaller than this share of it is used once more
 
 
 class NotConverged(Exception):
@@ -45,7 +47,9 @@ def solve(system: System, *, bounded: bool) -> Step:
     v = system.bounded(system.present * system.momentum / system.safe_mass)  # as if nothing happened
     if not system.forces(v):
         raise NotConverged("particles left the grid, or their motion would fold them in one step")
-    tangent = Tangent(system, symmetric=True)
+    slow = system.launches.slow
+    slow.follow(system.kick, system.launches.arrays.lowest, system.launches.arrays.size)
+    tangent = Tangent(system, symmetric=True, again=True)
     if not system.coupled:
         blocks = torch.linalg.inv(tangent.inverse_blocks).diagonal(dim1=1, dim2=2).mean(1)[:, None]
         system.reach = torch.where(system.present > 0, system.mass / blocks, 1.0)
@@ -53,20 +57,27 @@ def solve(system: System, *, bounded: bool) -> Step:
     newton = products = 0
     before, residual = math.inf, system.residual(v)
     size = system.norm(residual)
+    newly = tangent.fresh
     while True:
         # a body that falls from rest has no spread and, so far, no speed
         rounding = system.noise(v, tangent.norm) + system.rounding * system.norm(free)
         goal = tolerance * (system.spread(free) + system.spread(v)) + rounding
         # within thirty of it, a residual that has stopped falling is rounding too
-        if size <= goal or 0.5 * before <= size <= 30 * goal:
+        if size <= goal or (newly and 0.5 * before <= size <= 30 * goal):
             return Step(v, newton, products)
         if newton == ITERATIONS:
             raise NotConverged(f"Newton has not converged in {ITERATIONS} iterations")
-        if newton:
+        if newton == 1:
+            system.launches.reached = size / before
+        # a tangent serves as long as it brings a digit
+        newly = newton > 0 and size > SERVES * before
+        if newly:
             tangent = Tangent(system, symmetric=True)
         constraints = Constraints(system, bounded=bounded)
         newton += 1
-        forcing = max(min(0.1, 0.5 * (size / before) ** 1.6), 0.3 * goal / size)
+        # more than the tangent is true to is not asked of a linear solve
+        true = 0.5 * (size / before) ** 1.6 if newly else 0.3 * (size / before if newton > 1 else system.launches.reached)
+        forcing = max(min(0.1, true), 0.3 * goal / size)
         d, used = _direction(system, tangent, constraints, residual, forcing * size)
         products += used
         slope = dot(system.mass * residual, d)
@@ -87,6 +98,10 @@ def solve(system: System, *, bounded: bool) -> Step:
             if size <= 30 * goal:
                 system.forces(v)
                 return Step(v, newton, products)
+            if not newly:  # the tangent was an old one
+                system.forces(v)
+                before = size
+                continue
             raise NotConverged(f"the line search of Newton iteration {newton} found no way down")
 
 
@@ -111,20 +126,31 @@ def _direction(
     extra = int(bool(outside.any()))
     if extra:
         rhs = rhs + constraints.derivative(tangent.stiff(outside), transposed=True)
-    d, used, _ = projected_gradients(system, tangent, constraints, rhs, target)
+    slow, course = system.launches.slow, Course()
+    d, used, solved = projected_gradients(system, tangent, constraints, rhs, target, slow, course)
+    if solved:
+        slow.learn(course, used)
     return d - outside, used + extra
 
 
 def projected_gradients(
-    system: System, tangent: Tangent, constraints: Constraints, rhs: Tensor, target: float
+    system: System,
+    tangent: Tangent,
+    constraints: Constraints,
+    rhs: Tensor,
+    target: float,
+    slow: SlowModes,
+    course: Course | None = None,
 ) -> tuple[Tensor, int, bool]:
     """x = P x with P^T (M + K) x = rhs = P^T rhs; products with K; is the residual at most `target` [kg^1/2 m/s]?
 
-    Preconditioned by P D^-1 P^T, D the diagonal blocks of M + K."""
+    Preconditioned by P (D^-1 + W) P^T, D the diagonal blocks of M + K, W the correction by slow modes. All residuals
+    are P^T of themselves."""
     return conjugate_gradients(
         lambda p: constraints.derivative(system.mass * p + tangent.stiff(p), transposed=True),
         rhs,
-        precondition=lambda r: constraints.derivative(tangent.block(constraints.derivative(r, transposed=True))),
+        precondition=lambda r: constraints.derivative(tangent.block(r) + slow.correction(r)),
         size=lambda r: math.sqrt(dot(r, system.inverse_mass * r)),
         target=target,
+        course=course,
     )

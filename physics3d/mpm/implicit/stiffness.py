@@ -12,15 +12,15 @@ import warp as wp
 from physics3d.mpm import columns
 from physics3d.mpm.hooks import KICK
 from physics3d.mpm.stencil import stencil
-from physics3d.warp_types import matrix, vector
+from physics3d.warp_types import matrix, vector, vector4
 
 
 @cache
-def stiffness(real) -> wp.Kernel:
-    """Kernel: K w, in one pass over the particles."""
-    vec3, mat33 = vector(real), matrix(real)
+def stiffness(real, sums, fast: bool) -> wp.Kernel:
+    """Kernel: K w, in one pass over the particles, added up in the precision of `sums` as by `scatter`."""
+    vec3, vec4, mat33 = vector(real), vector4(sums), matrix(real)
     first_node, local, weights, _ = stencil(real)
-    gathered, spread = columns.gathered(real, fast=False), columns.spread_vectors(real)
+    gathered, spread = columns.gathered(real, fast), columns.spread(real, fast, sums)
 
     @wp.kernel(module="unique", enable_backward=False)
     def stiffness_kernel(
@@ -37,7 +37,7 @@ def stiffness(real) -> wp.Kernel:
         C: wp.array2d(dtype=real),  # [p, 81] dT_ab/dL_ce [Pa s], at 27 a + 9 b + 3 c + e
         w: wp.array(dtype=vec3),  # [node] in any unit
         # out
-        Kw: wp.array(dtype=vec3),  # [node], added to [kg times the unit of w]
+        Kw: wp.array(dtype=vec4),  # [node], added to [kg times the unit of w]; the fourth number is of no use
     ):
         p = wp.tid() + first
         d = offset[p] + u[p] / dx
@@ -57,6 +57,6 @@ def stiffness(real) -> wp.Kernel:
                             total = total + C[p, 27 * a + 9 * b + 3 * c + e] * L[c, e]
                     A[a, b] = total
             A = (real(16.0) * clock[row[0], wp.static(KICK)] * volume[p] / (dx * dx)) * A
-            spread(Kw, node, ny, nz, weight, -(A * f), A)
+            spread(Kw, node, ny, nz, f, weight, vec3(), real(0.0), A)
 
     return stiffness_kernel
