@@ -39,7 +39,7 @@ class StepLaunches:
         self.E: wp.array = zeros(n, mat33)  # adjoint of T
         self.own: dict[str, wp.array] = {name: zeros(n, mat33) for name in ("T", "tau", "L", "L_gathered")}  # adjoints
         self.own |= {name: zeros(n, vec3) for name in ("v", "v_gathered", "unused")}
-        self.C: wp.array = zeros((n, 81), real)  # dT_ab/dL_ce [Pa s], at 27 a + 9 b + 3 c + e
+        self.C: wp.array = zeros((n, 81), real)  # dT_ab/dL_ce [Pa s], at 27 c + 9 e + 3 a + b
         self.moduli: wp.array = zeros((n, 2), real)  # of the isotropic tensor with the same means [Pa s]
         self.kick: float | None = None  # of the step whose symmetric C that is [s]; None: it is no step's
         self.reached: float = 0.01  # by which share the first solve of the last step left the residual smaller

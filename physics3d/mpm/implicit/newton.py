@@ -129,7 +129,7 @@ def _direction(
     slow, course = system.launches.slow, Course()
     d, used, solved = projected_gradients(system, tangent, constraints, rhs, target, slow, course)
     if solved:
-        slow.learn(course, used)
+        slow.learn(course, used, math.log10(system.norm(residual) / target))
     return d - outside, used + extra
 
 

@@ -48,7 +48,7 @@ class SlowModes:
         self.eigenvalues: Tensor | None = None  # [k]
         self.lowest: tuple[int, ...] = ()
         self.size: tuple[int, ...] = ()
-        self.alone = 0  # products of the solve that had none of them
+        self.alone = 0.0  # products per digit of the solve that had none of them
 
     def follow(self, kick: float, lowest: tuple[int, ...], size: tuple[int, ...]) -> None:
         """To a step of another length, or on another window of nodes."""
@@ -76,11 +76,11 @@ class SlowModes:
             return 0.0
         return (self.vectors.T @ ((self.vectors @ r.flatten()) / self.eigenvalues)).view_as(r)
 
-    def learn(self, course: Course, used: int) -> None:
-        """From a solve that took `used` products."""
+    def learn(self, course: Course, used: int, digits: float) -> None:
+        """From a solve that took `used` products to make the residual smaller by so many `digits`."""
         if self.vectors is None:
-            self.alone = used
-        elif used >= self.alone:
+            self.alone = used / digits
+        elif used >= self.alone * digits:
             self.forget()
             return
         n = min(len(course.z), len(course.a))

@@ -40,7 +40,7 @@ class Tangent:
                 adjoint_L.zero_()
                 wp.to_torch(launches.own["v"]).zero_()
             launches.on_particles("stress_adjoint", "advance_adjoint", "steer_adjoint")
-            C.view(n, 9, 9)[:, k] = adjoint_L.view(n, 9)
+            C.view(n, 9, 9)[:, :, k] = adjoint_L.view(n, 9)
         square = C.view(n, 9, 9)
         launches.kick = self.system.kick if self.symmetric else None
         if self.symmetric:
@@ -65,7 +65,7 @@ class Tangent:
 
     def block(self, x: Tensor) -> Tensor:
         """D^-1 x, D the diagonal blocks of M + K."""
-        return (self.inverse_blocks * x[:, None, :]).sum(2)
+        return torch.bmm(self.inverse_blocks, x[:, :, None])[:, :, 0]
 
     def _inverse_blocks(self, C: Tensor) -> Tensor:
         system, n = self.system, len(C)
