@@ -19,9 +19,9 @@ DX, STEPS = 0.1, 5
 
 
 def substeps(
-    material, *, fast: bool, moved: bool = False, threads: int = 1, recorded: bool = False
+    material, *, fast: bool, moved: bool = False, threads: int = 1, recorded: bool = False, floor: bool = True
 ) -> tuple[Substeps, np.ndarray]:
-    """A block of 3 x 3 x 3 cells in motion, pushed, turned and above a floor that it touches if `moved`, and the clock
+    """A block of 3 x 3 x 3 cells in motion, pushed, turned and, with a `floor`, touching that, if `moved`; and the clock
     of some substeps."""
     import warp as wp
 
@@ -36,8 +36,8 @@ def substeps(
         point=(0.15, 0.15, 0.05), axis=(0.0, 0.1, 1.0), radius=0.12, half_height=0.06, angular_velocity=5.0,
         start=0.0, duration=1.0,
     )  # fmt: skip
-    floor = HalfSpace(point=(0.0, 0.0, 0.01), normal=(0.0, 0.0, 1.0), kind="separate")
-    boundaries = [push, turn, floor] if moved else []
+    ground = HalfSpace(point=(0.0, 0.0, 0.01), normal=(0.0, 0.0, 1.0), kind="separate")
+    boundaries = [push, turn, *([ground] if floor else [])] if moved else []
     coefficients = material.coefficients(tensors(material.example)).expand(-1, n).contiguous()
     dt = 0.1 * DX * (1000.0 / float(material.wave_modulus(coefficients).max())) ** 0.5
     signals = [boundary.signals(0.0, dt) for boundary in boundaries]

@@ -33,7 +33,9 @@ class Groups:
         ratio = torch.where((leader == HELD) | (~follows & (system.present[:, 0] == 0)), 0.0, ratio)
         inertia = torch.zeros_like(mass).index_add_(0, self.top, ratio.square() * mass)
         self.ratio: Tensor = ratio[:, None]
-        self.mobility: Tensor = (system.decay / torch.where(inertia > 0, inertia, torch.inf))[self.top, None] * self.ratio
+        self.mobility: Tensor = (system.decay / torch.where(inertia > 0, inertia, torch.inf))[
+            self.top, None
+        ] * self.ratio
 
     def __call__(self, x: Tensor) -> Tensor:
         return self.mobility * torch.zeros_like(x).index_add_(0, self.top, self.ratio * x)[self.top]

@@ -76,7 +76,9 @@ def solve(system: System, *, bounded: bool) -> Step:
         constraints = Constraints(system, bounded=bounded)
         newton += 1
         # more than the tangent is true to is not asked of a linear solve
-        true = 0.5 * (size / before) ** 1.6 if newly else 0.3 * (size / before if newton > 1 else system.launches.reached)
+        true = (
+            0.5 * (size / before) ** 1.6 if newly else 0.3 * (size / before if newton > 1 else system.launches.reached)
+        )
         forcing = max(min(0.1, true), 0.3 * goal / size)
         d, used = _direction(system, tangent, constraints, residual, forcing * size)
         products += used
