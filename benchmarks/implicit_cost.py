@@ -1,6 +1,6 @@
 """What an implicit step costs, in explicit substeps of the same body.
 
-    make bench-implicit_cost [ARGS="version=<words>"]   ->   docs/results/simulation_implicit.csv, and simulation.md anew
+    make bench-implicit_cost [ARGS="version=<words>"]   ->   docs/results/simulation_implicit.csv, simulation.md
 
 A block of 16 x 10 x 10 cells with 12 800 particles, clamped at one end, falls and swings; fixed corotated, float32, one
 thread. Its stiffness is such that a step of 1/24 s is `times` explicit substeps at their limit. `first` is a rollout of

@@ -21,8 +21,8 @@ DX, STEPS = 0.1, 5
 def substeps(
     material, *, fast: bool, moved: bool = False, threads: int = 1, recorded: bool = False, floor: bool = True
 ) -> tuple[Substeps, np.ndarray]:
-    """A block of 3 x 3 x 3 cells in motion, pushed, turned and, with a `floor`, touching that, if `moved`; and the clock
-    of some substeps."""
+    """A block of 3 x 3 x 3 cells in motion, pushed, turned and, with a `floor`, touching that, if `moved`; and the
+    clock of some substeps."""
     import warp as wp
 
     start_warp()

@@ -49,7 +49,7 @@ def test_a_solve_finds_the_lowest_eigenvectors_and_the_next_one_is_as_short_as_w
     # a solve to 1e-8 knows them to the square of that, the highest of the four to less
     torch.testing.assert_close(values[:4], torch.tensor(LOW, dtype=torch.float64), rtol=1e-3, atol=0)
     x, used = solved(matrix, second, slow)
-    # eigenvalues from 1 to 8: (sqrt 8 - 1)/(sqrt 8 + 1) per product, 1e-8 in 25; four low ones cost the first solve more
+    # eigenvalues from 1 to 8: (sqrt 8 - 1)/(sqrt 8 + 1) per product, 1e-8 in 25; four low ones cost the first more
     assert used <= 27 < alone
     torch.testing.assert_close(x, torch.linalg.solve(matrix, second), rtol=0, atol=1e-4 * float(x.abs().max()))
 
