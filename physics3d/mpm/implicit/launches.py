@@ -42,7 +42,9 @@ class StepLaunches:
         self.C: wp.array = zeros((n, 81), real)  # dT_ab/dL_ce [Pa s], at 27 c + 9 e + 3 a + b
         self.moduli: wp.array = zeros((n, 2), real)  # of the isotropic tensor with the same means [Pa s]
         self.kick: float | None = None  # of the step whose symmetric C that is [s]; None: it is no step's
-        self.reached: float = 0.01  # by which share the first solve of the last step left the residual smaller
+        # what the first solve of the last step left of the residual, with a tangent of the step before and with its own
+        self.reached: dict[bool, float] = {False: 0.01, True: 0.01}
+        self.own_tangents: int = 0  # steps that are to come before the tangent of the last one is tried again
         self.slow: SlowModes = SlowModes()
         self.folded: list[wp.array] = [zeros(1, wp.int32) for _ in self.arrays.ranges]  # particles
         # on the nodes

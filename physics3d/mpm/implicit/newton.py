@@ -23,6 +23,8 @@ from physics3d.mpm.implicit.tangent import Tangent
 
 ITERATIONS = 30
 TRIES = 10  # of one line search
+PAYS = 2  # iterations with the tangent of the step before; after more of them the next OWN steps make their own
+OWN = 4
 SERVES = 0.1  # a tangent that left the residual smaller than this share of it is used once more
 
 
@@ -47,9 +49,11 @@ def solve(system: System, *, bounded: bool) -> Step:
     v = system.bounded(system.present * system.momentum / system.safe_mass)  # as if nothing happened
     if not system.forces(v):
         raise NotConverged("particles left the grid, or their motion would fold them in one step")
-    slow = system.launches.slow
-    slow.follow(system.kick, system.launches.arrays.lowest, system.launches.arrays.size)
-    tangent = Tangent(system, symmetric=True, again=True)
+    launches = system.launches
+    launches.slow.follow(system.kick, launches.arrays.lowest, launches.arrays.size)
+    tangent = Tangent(system, symmetric=True, again=launches.own_tangents == 0)
+    launches.own_tangents = max(0, launches.own_tangents - 1)
+    own = tangent.fresh
     if not system.coupled:
         blocks = torch.linalg.inv(tangent.inverse_blocks).diagonal(dim1=1, dim2=2).mean(1)[:, None]
         system.reach = torch.where(system.present > 0, system.mass / blocks, 1.0)
@@ -64,11 +68,13 @@ def solve(system: System, *, bounded: bool) -> Step:
         goal = tolerance * (system.spread(free) + system.spread(v)) + rounding
         # within thirty of it, a residual that has stopped falling is rounding too
         if size <= goal or (newly and 0.5 * before <= size <= 30 * goal):
+            if not own and newton > PAYS:
+                launches.own_tangents = OWN
             return Step(v, newton, products)
         if newton == ITERATIONS:
             raise NotConverged(f"Newton has not converged in {ITERATIONS} iterations")
         if newton == 1:
-            system.launches.reached = size / before
+            launches.reached[own] = size / before
         # a tangent serves as long as it brings a digit
         newly = newton > 0 and size > SERVES * before
         if newly:
@@ -76,9 +82,8 @@ def solve(system: System, *, bounded: bool) -> Step:
         constraints = Constraints(system, bounded=bounded)
         newton += 1
         # more than the tangent is true to is not asked of a linear solve
-        true = (
-            0.5 * (size / before) ** 1.6 if newly else 0.3 * (size / before if newton > 1 else system.launches.reached)
-        )
+        left = size / before if newton > 1 else launches.reached[own]
+        true = 0.5 * left**1.6 if newly and newton > 1 else 0.3 * left
         forcing = max(min(0.1, true), 0.3 * goal / size)
         d, used = _direction(system, tangent, constraints, residual, forcing * size)
         products += used
