@@ -131,8 +131,7 @@ def write(rows: list[dict[str, Any]]) -> None:
         text += ["", *(spread(mine, key, unit) for key, unit in scene.shown.items())]
         if name == "bird":
             text.append(
-                "- PAC-NeRF's own answer, from the same clips: 2.78e5 Pa, 0.273; the values usually quoted for the data: "
-                "3e5 Pa, 0.3"
+                "- PAC-NeRF, from the same clips: 2.78e5 Pa and 0.273; usually quoted for the data: 3e5 Pa and 0.3"
             )
         text += [""]
     (RESULTS / "starts.md").write_text("\n".join(text))

@@ -111,10 +111,8 @@ def models(plan: Plan) -> list[str]:
     steps = {step.name: step for step in plan.steps}
     learned = peek(steps["learn"].folder) if "learn" in steps else {}
     odds, next_ones = learned.get("models", {}), learned.get("film_next", {})
-    said = [
-        f"{name}: {'explains the clip as well, a tie' if value < TIE else 'does not explain the clip'} (ln B {value:+.1f})"
-        for name, value in odds.items()
-    ]
+    verdict = lambda value: "explains the clip as well: a tie" if value < TIE else "does not explain the clip"
+    said = [f"{name}: {verdict(value)} (ln B {value:+.1f})" for name, value in odds.items()]
     for name, value in sorted(next_ones.items(), key=lambda one: -one[1]):
         settles = "should settle it" if value >= TIE else "would hardly settle it"
         said.append(f"to film next: {name}: {settles} (ln B {value:+.1f})")

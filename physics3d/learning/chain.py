@@ -22,7 +22,6 @@ from physics3d.scenes.base import Capture, Take
 from physics3d.solver import Motion, motion_of
 from physics3d.world import World
 
-
 LONGER = 3.0  # than the clip, is what could be filmed next
 PULL = 1 / 3  # of the force of a push, that pulls steadily
 
@@ -138,7 +137,7 @@ def recordings(
     many times as long it is filmed)."""
     long = LONGER * seconds
     found: dict[str, tuple[tuple[AbstractBoundary, ...], float]] = {
-        f"the same again, filmed for {long:.2g} s, until it has come to rest": (excitation, LONGER)
+        f"the same again, filmed for {long:.2g} s": (excitation, LONGER)
     }
     pushes = [b for b in excitation if isinstance(b, Impulse) and b.force is not None and any(map(float, b.force))]
     if len(pushes) != 1:  # several together have no side

@@ -1,7 +1,7 @@
 """How much a clip speaks for one theta against another, where residuals hang together in space and time.
 
-With r the residuals at theta, N L = |r|^2/2 their loss, Delta the difference that the other theta makes to the data, and
-B the variance of Delta . r (`sandwich.py`, of Delta as if it were a derivative),
+With r the residuals at theta, N L = |r|^2/2 their loss, Delta the difference that the other theta makes to the data,
+and B the variance of Delta . r (`sandwich.py`, of Delta as if it were a derivative),
 
     lambda = B/|Delta|^2,     T = 2 N (L_other - L)/lambda
 

@@ -41,7 +41,7 @@ class Chain:
     estimator: AbstractEstimator = field(default_factory=ScoreDistillation)
     # theta [k], ln of a factor on every known force -> trajectory; None: no force is known that drives the motion
     pushed: Callable[[Tensor, float], Any] | None = None
-    # what could be filmed next, in words -> what makes its motions by theta, with as many frames; costs time when called
+    # what could be filmed next, in words -> what makes its motions by theta, of as many frames; takes time when called
     recordings: Mapping[str, Callable[[], Callable[[Tensor], Any]]] = field(default_factory=dict)
     on_grid: bool = True  # whether a grid moves the body, whose resolution a stiffness then hangs on
     journal: Journal = field(default_factory=lambda: Journal(Log(None)))

@@ -15,7 +15,7 @@ the first clip,
 
     N rise = min over d of 1/2 d^T A d + 1/2 |z - z_simpler - J d|^2
 
-tells by the same ln B how far each would settle it, were it filmed as well as this clip. (The design of experiments that
+tells by the same ln B how far each would settle it, were it filmed as well as this clip. (Experiments designed to
 discriminate: Atkinson and Fedorov 1975.)
 """
 

@@ -17,9 +17,9 @@ STEP = math.log(4)
 
 
 def aliased(frames: int, noise: float, swings: float, generator: np.random.Generator):
-    """(course, what does as well, found, truth) of a thing that swings `swings` times, ln of its stiffness theta from the
-    truth, filmed in so many frames whose pixels, 40 of them, err independently. Search by a factor 4, then the bottom
-    of a valley."""
+    """(course, what does as well, found, truth) of a thing that swings `swings` times, ln of its stiffness theta from
+    the truth, filmed in so many frames whose pixels, 40 of them, err independently. Search by a factor 4, then the
+    bottom of a valley."""
     t = np.linspace(0, 1, frames)[1:, None]
     gain = generator.normal(size=(1, 40))
     model = lambda theta: gain * np.sin(2 * np.pi * swings * math.exp(theta / 2) * t)

@@ -9,6 +9,8 @@ import torch
 from scipy import stats
 from scipy.linalg import expm
 
+from physics3d.boundaries.impulse import Impulse
+from physics3d.learning.chain import recordings
 from physics3d.learning.fields import GlobalField
 from physics3d.learning.likelihood import ratio
 from physics3d.learning.loss import Chain
@@ -167,3 +169,18 @@ def test_a_likelihood_ratio_counts_residuals_as_often_as_they_are_independent():
         beyond += found.statistic > stats.t.ppf(0.95, found.freedom) ** 2
         naive += 2 * rise > stats.chi2.ppf(0.9, 1)
     assert 0.03 <= beyond / 300 <= 0.2 and naive / 300 > 0.4
+
+
+def test_recordings_are_such_as_a_person_can_make():
+    """A push as strong, across the first; a steady pull along it, weaker, to the end of a longer clip."""
+    for force in ((0.09, 0.02, 0.0), (0.0, 0.0, -0.3), (0.1, 0.0, 0.05)):
+        push = Impulse(force=force, centre=(0.0, 0.0, 0.2), radius=0.05, duration=0.1)
+        still = Impulse(acceleration_of_each=(0.0, 0.0, -1.0), centre=(0.0, 0.0, 0.2), radius=0.05, duration=1.0)
+        (again, long), (aside, _), (pulled, longer) = recordings((push, still), 2.0).values()
+        assert again == (push, still) and aside[1] == pulled[1] == still and long == longer == 3
+        one, two, weak = np.array(force), np.array(aside[0].force), np.array(pulled[0].force)
+        assert np.linalg.norm(two) == pytest.approx(np.linalg.norm(one))
+        assert abs(one @ two) <= 0.3 * (one @ one)  # another side
+        assert np.cross(one, weak) == pytest.approx(np.zeros(3)) and 0 < weak @ one < 0.5 * (one @ one)
+        assert pulled[0].duration >= 3 * 2.0
+    assert len(recordings((push, push), 2.0)) == len(recordings((still,), 2.0)) == len(recordings((), 2.0)) == 1
