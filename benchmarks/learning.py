@@ -7,8 +7,9 @@ Every run has a body and a material of its own (`learning_twins.py`), and starts
 the relaxation time, with noise on every pixel and a density that is wrong by about 10 %. It goes through the stages of
 the pipeline from the filling on: fill, learn, simulate and render the push that was held out. The Gaussians are the
 twin's own, on its true surface, for reconstruction is slow; what is filled into them swings 1 to 4 % too fast, and
-`learn.beyond.surface` is 0.05 here. Every run is in the table, the best and the worst. Then truth that the learner was
-handed is taken away, one thing at a time.
+`learn.beyond.surface` is 0.05 here. Every run is in the table, the best and the worst. Then the surface is taken away,
+and reconstructed from photographs, with the width of the default profile; and other truth that the learner was handed,
+one thing at a time.
 
 A run that is done stands in the .csv and is not done again, so this may be stopped at any time; remove the file to
 begin anew. Times are processor time of one thread, for the machine is shared.
@@ -27,7 +28,7 @@ from typing import Any
 
 import torch
 from learning_page import write
-from learning_twins import DENSITY, Twin, drawn, twin_source
+from learning_twins import DENSITY, Twin, drawn, photographed, twin_source
 
 from physics3d.log import Log
 from physics3d.metrics.image import psnr
@@ -52,6 +53,8 @@ WORDS = (
 SHOWN = "carnation"  # whose truth is taken away, with three cameras
 SURFACE = 0.05  # width of the stiffness by the filling: its frequencies are 1 to 4 % off
 WRONG = 1.1  # density and force as given, of the true ones, where they are taken away
+SHAPE = "shape"  # what is taken away where the surface is reconstructed
+PHOTOGRAPHED = ("reconstruct.iterations=600", "reconstruct.max_gaussians=6000", "reconstruct.longest_side=240")
 HANDED = ("nothing", "density", "force", "poissons_ratio", "tie of times", "ratio of mu to K", "all of these")
 NAMED = {
     "E": "youngs_modulus", "mu": "branch_shear_modulus", "tau": "shear_relaxation_time", "nu": "poissons_ratio",
@@ -113,6 +116,9 @@ def runs(options: dict[str, str]) -> Iterator[Run]:
         for cameras in options["cameras"].split(","):
             for scene in options["scenes"].split(","):
                 yield Run(scene=scene, cameras=int(cameras), seed=int(seed))
+    for seed in options["seeds"].split(","):
+        for scene in options["scenes"].split(","):
+            yield Run(scene=scene, cameras=3, seed=int(seed), taken=SHAPE)
     if SHOWN in options["scenes"].split(","):
         for taken in HANDED:
             yield Run(scene=SHOWN, cameras=3, seed=0, taken=taken)
@@ -130,7 +136,7 @@ def tried(run: Run) -> dict[str, Any]:
 
 def learned(run: Run) -> dict[str, Any]:
     """Draw the body, learn from its films, and foretell the push that was held out. Raises ValueError as stages do."""
-    config, _ = compose([f"scene={run.scene}", *WORDS])
+    config, _ = compose([f"scene={run.scene}", *WORDS, *PHOTOGRAPHED])
     of = lambda name, config=config: build(config[name], "cpu", name)
     source = twin_source(build(config["scene"]["source"], "cpu", "scene.source"), run.scene)
     twin = drawn(run.scene, source, of("world"), cameras=run.cameras, seed=run.seed, log=Log(None))
@@ -139,12 +145,16 @@ def learned(run: Run) -> dict[str, Any]:
     frames = len(capture.takes[0].videos[0])
     beyond = replace(learn.beyond, surface=SURFACE, density=DENSITY, length=0.0)
     learn = replace(learn, world=twin.given, frames=frames, beyond=beyond, guess_widths={})
-    if run.taken:
+    began = time.process_time()
+    if run.taken == SHAPE:
+        capture = photographed(twin, source, run.seed)
+        gaussians = of("reconstruct")(capture, log=Log(None))
+        learn = replace(learn, beyond=replace(beyond, surface=of("learn").beyond.surface))
+    elif run.taken:
         learn = without(run.taken, learn, twin)
         capture = replace(
             capture, takes=tuple(replace(take, excitation=pushed(run.taken, take.excitation)) for take in capture.takes)
         )
-    began = time.process_time()
     body = replace(fill, spacing=twin.spacing)(capture, gaussians, None, log=Log(None))
     estimate = learn(capture, gaussians, body, log=Log(None))
     seconds = time.process_time() - began

@@ -34,6 +34,11 @@ clips, the shape, the push and a wrong weight, and believed at first that the th
   foretold [dB]. More is better; the noise of the clips lets nobody much above {ceiling:.1f} dB.
 """
 
+SHAPE = "shape"  # what is taken away in the runs whose surface is reconstructed
+PHOTOGRAPHED = """
+The same bodies, clips and starts by three cameras, but the learner has the shape from {shots} photographs of {width} x
+{height} px, by `{words}`, and allows for it (`learn.beyond.surface` as configured).
+"""
 HANDED = """
 The {scene} by {cameras} cameras, each time the same clips. First the learner is handed all but what it learns: density,
 push, Poisson's ratio, that both relaxation times are one, and the ratio of both branch moduli. Then one of these is
@@ -63,7 +68,10 @@ def write(rows: list[Row], folder: Path, total: int) -> None:
     lines += [
         f"- {row['scene']}, {row['cameras']} camera(s), seed {row['seed']} failed: {row['failed']}" for row in failed
     ]
-    lines += ["", "## What each thing that is handed over is worth", "", *handed([row for row in done if row["taken"]])]
+    shaped = [row for row in done if row["taken"] == SHAPE]
+    lines += ["", "## The shape from photographs", "", *photographed(runs, shaped)]
+    others = [row for row in done if row["taken"] not in ("", SHAPE)]
+    lines += ["", "## What each thing that is handed over is worth", "", *handed(others)]
     (folder / "learning.md").write_text("\n".join(lines) + "\n")
     draw(runs).savefig(folder / "learning.png", dpi=100)
 
@@ -165,6 +173,34 @@ def between(row: Row, name: str) -> str:
     low, high = (float(row[f"{name}_{end}"]) / float(row[name]) for end in ("low", "high"))
     text = f"{low:.2f} to {high:.2f}"
     return text if holds(row, name) else f"**{text}**"
+
+
+def photographed(runs: list[Row], shaped: list[Row]) -> list[str]:
+    """The runs with a reconstructed shape beside those with the true one."""
+    if not shaped:
+        return ["No run yet."]
+    from learning import PHOTOGRAPHED as WORDS_OF_SHAPE
+    from learning_twins import PHOTOGRAPH, SHOTS
+
+    said = PHOTOGRAPHED.format(shots=SHOTS, width=PHOTOGRAPH[0], height=PHOTOGRAPH[1], words=" ".join(WORDS_OF_SHAPE))
+    head = "| body | seed | **E found / truth** | 90 % | with the true shape | tau found / truth | 90 % "
+    head += "| mu_N found / truth | 90 % | still, learned [dB] | with the true shape | particles | time [s] |"
+    lines = [*said.strip().splitlines(), "", head, "|---" * (head.count("|") - 1) + "|"]
+    true = {(row["scene"], row["seed"]): row for row in runs if row["cameras"] == "3"}
+    for row in shaped:
+        other = true.get((row["scene"], row["seed"]))
+        cells = [row["scene"], row["seed"], f"{math.exp(ratio(row, 'E')):.3f}", between(row, "E")]
+        cells.append("" if other is None else f"{math.exp(ratio(other, 'E')):.3f}")
+        for name in ("tau", "mu"):
+            cells += [f"{math.exp(ratio(row, name)):.3f}", between(row, name)]
+        cells.append(f"{float(row['still']):.1f}, {float(row['psnr']):.1f}")
+        cells.append("" if other is None else f"{float(other['psnr']):.1f}")
+        cells += [row["particles"], f"{float(row['seconds']):.0f}"]
+        lines.append(f"| {' | '.join(cells)} |")
+    hits, number = covered(shaped, ("E", "mu", "tau"))
+    error = np.mean([abs(ratio(row, "E")) for row in shaped]) / math.log(10)
+    lines += ["", f"Intervals hold {hits} of {number} truths; mean of abs(log10 E/truth) {error:.3f}."]
+    return lines
 
 
 def handed(rows: list[Row]) -> list[str]:

@@ -31,6 +31,7 @@ from physics3d.gaussians.cameras import Camera
 from physics3d.gaussians.deform import render_deformed
 from physics3d.gaussians.embedding import embed
 from physics3d.gaussians.model import Gaussians
+from physics3d.gaussians.render import render
 from physics3d.log import Log
 from physics3d.scenes import carnation
 from physics3d.scenes.base import Capture, Take
@@ -45,6 +46,8 @@ from physics3d.world import World
 DENSITY = 0.1  # deviation of the logarithm of the density as given
 NOISE = 2.0 / 255  # deviation of a pixel
 SIDE = (80, 60)  # of the pictures [px]
+SHOTS, RINGS = 24, (-12.0, 14.0, 44.0)  # photographs, on rings so high above the horizon [deg]
+PHOTOGRAPH = (240, 180)  # their size [px]
 EVERY = 2  # so many frames of the scene's takes are one
 PARTICLES = 700  # about so many are learned with, where the scene's spacing would give more
 COUNT = 2000  # Gaussians, small enough for tangents to stay near a round surface
@@ -210,6 +213,40 @@ def lens(source: CarnationTwin | MadeTwin, taller: float, elevation: float, azim
     return ring(
         at, distance=distance, elevation=elevation, azimuths=azimuths, width=SIDE[0], height=SIDE[1], opening=opening
     )
+
+
+def photographed(twin: Twin, source: CarnationTwin | MadeTwin, seed: int) -> Capture:
+    """The same body without its shape: SHOTS noisy photographs of it at rest with mattes, and points of its surface."""
+    rng = np.random.default_rng((seed, SHOTS))
+    gaussians = twin.capture.gaussians
+    assert gaussians is not None
+    low, high = gaussians.mean.amin(0), gaussians.mean.amax(0)
+    taller = float(high[2]) / max(float(mesh.vertices[:, 2].max()) for mesh in source.solids())
+    each = SHOTS // len(RINGS)
+    turned = 360.0 * np.arange(each) / each
+    cameras = [
+        camera.scaled(PHOTOGRAPH[0] / SIDE[0])
+        for i, height in enumerate(RINGS)
+        for camera in lens(source, taller, height, turned + 360.0 * i / SHOTS)
+    ]
+    images, alphas = [], []
+    for camera in cameras:
+        with torch.no_grad():
+            drawn = render(gaussians, camera, background=torch.tensor(BACKGROUND))
+        noisy = drawn.color.numpy() + NOISE * rng.standard_normal(drawn.color.shape)
+        images.append(torch.from_numpy((255 * np.clip(noisy, 0, 1) + 0.5).astype(np.uint8)))
+        alphas.append((255 * drawn.alpha.reshape(camera.height, camera.width) + 0.5).clamp(0, 255).to(torch.uint8))
+    points = gaussians.mean + 1e-3 * float((high - low).norm()) * torch.from_numpy(
+        rng.normal(size=gaussians.mean.shape)
+    )
+    found = replace(
+        twin.capture, images=tuple(images), alphas=tuple(alphas), cameras=tuple(cameras),
+        names=tuple(f"view_{i:03}" for i in range(len(cameras))), points=points.float(),
+        point_colors=(0.5 + 0.28209479177387814 * gaussians.sh[:, 0]).clamp(0, 1), single_object=True,
+        gaussians=None, moves=None,
+    )  # fmt: skip
+    found.check()
+    return found
 
 
 def filmed(

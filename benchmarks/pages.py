@@ -60,6 +60,7 @@ def main(words: list[str]) -> None:
     scores = steps["evaluate"].folder / "scores.md" if "evaluate" in steps else None
     if scores is not None:
         lines += [scores.read_text(), ""]
+    lines += [*(f"- {sentence}" for sentence in models(plan)), ""]
     real = "path" in config["scene"]["source"]
     for stage, patterns in PICTURES.items():
         if stage not in steps:

@@ -42,6 +42,8 @@ class Estimate(AbstractArtifact):
     velocity: Float[Tensor, "3"]  # of the body at the start [m/s]
     history: dict[str, list[float]] = field(default_factory=dict)  # curves of the learning
     intervals: dict[str, Interval] = field(default_factory=dict)  # of what was learned, by name; velocity_x, ... too
+    models: dict[str, float] = field(default_factory=dict)  # simpler ones -> ln of the odds for this one against them
+    film_next: dict[str, float] = field(default_factory=dict)  # recordings -> ln of the odds that they should add
 
     def check(self) -> None:
         check_old_names(self.parameters)

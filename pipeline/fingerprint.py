@@ -41,7 +41,6 @@ LIBRARIES = {
     "PIL": ("pillow",),
     "open3d": ("open3d-cpu", "open3d"),
     "pycolmap": ("pycolmap",),
-    "torchmetrics": ("torchmetrics",),
     "diffusers": ("diffusers",),
     "transformers": ("transformers",),
     "sam2": ("sam2",),

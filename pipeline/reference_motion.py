@@ -53,7 +53,7 @@ def write(words: list[str]) -> None:
     print(f"mesh      {body.gradient.shape[1]} nodes, {1e6 * body.weight.sum():.1f} cm^3", flush=True)
     found = finite_elements.frequencies(body, world, 4)
     print(f"stuck     {', '.join(f'{f:.4g}' for f in found)} Hz", flush=True)
-    place, _ = particles(solids, world.dx / 2, source.seed)
+    place = reference_motion.evenly(particles(solids, world.dx / 2, source.seed)[0])
     moved = {}
     for role, push in source.pokes().items():
         with tempfile.TemporaryDirectory(prefix="physics3d_") as notes:

@@ -51,6 +51,8 @@ def report(plan: Plan, hits: dict[str, bool]) -> dict[str, float]:
             row.append("?" if p.truth is None else f"{p.truth:.4g}")
         parameters.add_row(p.name, *row)
     console.print(parameters)
+    for sentence in told.models(plan):
+        console.print(sentence, markup=False)
 
     for judged in told.scores(plan):
         scores = table("score", *judged.metrics)

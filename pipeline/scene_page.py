@@ -38,6 +38,7 @@ def scene_page(words: list[str]) -> tuple[str, str]:
         units=_units(),
         slices=_slices(left),
         parameters=told.parameters(plan),
+        models=told.models(plan),
         truth_source=peek(steps["capture"].folder).get("truth_source", ""),
         stages=[_stage(n, t) for n, t in left.items()],
         left_out=plan.left_out,

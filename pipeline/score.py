@@ -36,7 +36,6 @@ def score(real: Path, predicted: Path, folder: Path) -> None:
 
     from physics3d.log import Log
     from physics3d.metrics.against import Reference
-    from physics3d.metrics.image import psnr_per_frame, ssim_per_frame
     from physics3d.metrics.pair import paired
     from physics3d.metrics.pictures import busiest, curves, slices
     from physics3d.metrics.scores import Scores
@@ -52,7 +51,8 @@ def score(real: Path, predicted: Path, folder: Path) -> None:
     half = Reference(pair.real[seen:], pair.fps)
     notes = {str(i + 1): note for i, note in enumerate(pair.notes)}
     clips = {"prediction": pair.predicted[seen:], **stills(pair.real, seen=seen)}
-    second = {"real": half.itself()[0]} | {name: half.measure(clip)[0] for name, clip in clips.items()}
+    measured = {name: half.measure(clip) for name, clip in clips.items()}
+    second = {"real": half.itself()[0]} | {name: cells for name, (cells, _, _) in measured.items()}
     all_of_it = {"real": whole.itself()[0], "prediction": whole.motion(pair.predicted)[0]}
     tables = [
         (title, Scores(values={name: plain(cells, title, notes) for name, cells in rows.items()}))
@@ -75,11 +75,8 @@ def score(real: Path, predicted: Path, folder: Path) -> None:
     for note in notes.values():
         console.print(note, markup=False)
     text += ["", *(f"- {note}" for note in notes.values())]
-    per_frame = {
-        "PSNR [dB]": {name: psnr_per_frame(clip, pair.real[seen:]) for name, clip in clips.items()},
-        "SSIM": {name: ssim_per_frame(clip, pair.real[seen:]) for name, clip in clips.items()},
-    }
-    log.image("curves", curves(per_frame, pair.fps, first=seen))
+    lines = {name: of_frames for name, (_, of_frames, _) in measured.items()}
+    log.image("curves", curves(lines, pair.fps, first=seen))
     log.image("slices", slices(["real", "prediction"], [pair.real, pair.predicted], *busiest(pair.real)))
     difference = 255 - (pair.real.int() - pair.predicted.int()).abs().to(pair.real.dtype)
     named = {"real": pair.real, "prediction": pair.predicted, "difference": difference}

@@ -11,6 +11,7 @@ from physics3d.truth import truth_of
 from pipeline.flow import Plan
 from pipeline.stage import Step, manifest, peek
 
+TIE = math.log(20.0)  # as in `physics3d/learning/which_model.py`, without torch
 JUDGES = ("foretell", "evaluate")  # steps whose result is a table of scores
 
 
@@ -103,6 +104,19 @@ def parameters(plan: Plan) -> list[Parameter]:
         Parameter(name=name, start=value, learned=learned.get(name), truth=truth_of(name, truth), **sides(name))
         for name, value in means(steps["guess"]).items()
     ]
+
+
+def models(plan: Plan) -> list[str]:
+    """Which simpler models the clip leaves open, and which recording would settle it: a sentence each."""
+    steps = {step.name: step for step in plan.steps}
+    learned = peek(steps["learn"].folder) if "learn" in steps else {}
+    odds, next_ones = learned.get("models", {}), learned.get("film_next", {})
+    verdict = lambda value: "explains the clip as well: a tie" if value < TIE else "does not explain the clip"
+    said = [f"{name}: {verdict(value)} (ln B {value:+.1f})" for name, value in odds.items()]
+    for name, value in sorted(next_ones.items(), key=lambda one: -one[1]):
+        settles = "should settle it" if value >= TIE else "would hardly settle it"
+        said.append(f"to film next: {name}: {settles} (ln B {value:+.1f})")
+    return said
 
 
 def scores(plan: Plan) -> list[Table]:

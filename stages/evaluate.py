@@ -81,7 +81,10 @@ class Evaluate:
         for row, clips in log.progress(list(rows.items()), "scoring"):
             per_camera = []
             for clip, reference in zip(clips, references):
-                cells, why = reference.itself() if row == REFERENCE else reference.measure(clip)
+                if row == REFERENCE:
+                    cells, why = reference.itself()
+                else:
+                    cells, _, why = reference.measure(clip)
                 if why:
                     notes.setdefault(f"oscillation of {row}", why)
                 per_camera.append(cells)

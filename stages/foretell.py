@@ -24,7 +24,7 @@ from physics3d.learning.identify import Swing, another_take, identified
 from physics3d.learning.seen_modes import observe
 from physics3d.learning.unknown_cause import Swung, by_its_own_camera, first_take, frames_seen, swung
 from physics3d.log import Log
-from physics3d.metrics.against import Reference
+from physics3d.metrics.against import Lines, Reference
 from physics3d.metrics.scores import REFERENCE, Scores
 from physics3d.metrics.take_page import take_page
 from physics3d.motion.image_modes import image_modes
@@ -136,12 +136,14 @@ class Foretell:
         clips |= stills(frames, seen=seen)
         measured = Reference(future, fps)
         found = {REFERENCE: _plain(measured.itself()[0], take.name, notes)}
+        lines: dict[str, Lines] = {}
         for name, clip in log.progress(list(clips.items()), f"scoring {take.name}"):
-            found[name] = _plain(measured.measure(clip)[0], take.name, notes)
+            cells, lines[name], _ = measured.measure(clip)
+            found[name] = _plain(cells, take.name, notes)
         said = [_swings(swing)] + [
             f"{about}: {why}" for about, why in notes.items() if about.startswith(f"{take.name}: ")
         ]
-        take_page(take.name, frames, fps, clips, found, seen=seen, said=said, best=SEEN, bar=IMAGE, log=log)
+        take_page(take.name, frames, fps, clips, found, lines, seen=seen, said=said, best=SEEN, bar=IMAGE, log=log)
         return {f"{take.name}: {name}": cells for name, cells in found.items()}
 
 

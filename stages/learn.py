@@ -4,7 +4,7 @@
 import dataclasses
 import math
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -34,15 +34,17 @@ from physics3d.learning.fields import AXES, AbstractField, GlobalField, physical
 from physics3d.learning.fit import fit
 from physics3d.learning.imagined import Imagined
 from physics3d.learning.interval import Beyond, Told, intervals, is_stiff, of_branches, posterior, told, words
+from physics3d.learning.likelihood import Ratio, ratios
 from physics3d.learning.linear import Shown, shown
 from physics3d.learning.loss import Chain
-from physics3d.learning.mirror import across, angular_frequency
+from physics3d.learning.mirror import NEAR, across, angular_frequency
 from physics3d.learning.polish import polish
-from physics3d.learning.rivals import widened
+from physics3d.learning.rivals import rivals, widened
 from physics3d.learning.search import search
 from physics3d.learning.stiffness_field import WIDTH, StiffnessField, asked_for, is_node, picture, trilinear
 from physics3d.learning.unknown_cause import learned_free
 from physics3d.learning.valley import reaches
+from physics3d.learning.which_model import compared, film_next, other_end
 from physics3d.log import Log
 from physics3d.pictures import contact_sheet, titled, to_uint8
 from physics3d.priors.base import AbstractPrior
@@ -56,7 +58,6 @@ Span = Annotated[float, Gt(1), Le(1e12)]  # a factor
 Width = Annotated[float, Gt(0), Le(20)]
 USUAL_FRAMES = 15  # of a clip, for priors that take any number
 USUAL_STEPS = 15  # of gradient descent, where nothing is polished
-SAME = 0.05  # of theta: two ends of a polish that are one
 LOOKS = 2  # along the valley: a lower place is polished once, and looked around from again
 
 
@@ -221,12 +222,17 @@ class Learn:
         beyond = self.beyond.of(section, self.world.dx, on_grid=chain.on_grid)
         with torch.no_grad():
             omega = angular_frequency(chain.simulate(theta))
+        equal, models, recordings = self.alike(chain, field, theta, seen, omega, course, log)
         learned = replace(
             start,
+            models=models,
+            film_next=recordings,
             parameters={name: v.detach().to(torch.float32) for name, v in field.parameters(theta).items()},
             velocity=field.velocity(theta).detach().to(torch.float32),
             history=known,
-            intervals=self.intervals(field, theta, seen, said, course, beyond, omega, log) if seen and said else {},
+            intervals=self.intervals(field, theta, seen, said, course, equal, beyond, omega, log)
+            if seen and said
+            else {},
         )
         self.report(capture, field, learned, seen, log)
         if log.folder is not None:
@@ -276,15 +282,46 @@ class Learn:
         time = lambda at: physical(field, at)["shear_relaxation_time"]
         log.info(f"a relaxation time of {time(there):.3g} s damps the swing as {time(theta):.3g} s do: tried as well")
         other, more = self.polished(chain, field, there, log)
-        if float((other - theta).abs().max()) < SAME:
-            return theta, points
         ends = [
             Point(way="across", theta=at, loss=way[-1].loss if way else chain.measure(at, self.seed))
             for at, way in ((theta, points), (other, more))
         ]
         worse, better = sorted(ends, key=lambda end: end.loss, reverse=True)
+        if abs(math.log(time(other) / time(theta))) < math.log(NEAR):  # it came back: one valley
+            return better.theta, [*points, *more, replace(better, way="polish")]
         log.info(f"{time(better.theta):.3g} s explain the clip better: loss {better.loss:.5g}, not {worse.loss:.5g}")
         return better.theta, [*points, *more, worse, replace(better, way="polish")]
+
+    def alike(
+        self,
+        chain: Chain,
+        field: AbstractField,
+        theta: Tensor,
+        seen: Shown | None,
+        omega: float,
+        course: list[Point],
+        log: Log,
+    ) -> tuple[list[Point], dict[str, float], dict[str, float]]:
+        """(what was tried and explains the clip as well; ln of the odds for what was learned against simpler models and
+        other valleys; what further recordings should add to them where the clip leaves a tie)."""
+        if seen is None or not course:
+            return [], {}, {}
+        against: dict[int, Ratio] = {}
+
+        def told_apart(points: list[Point]) -> list[bool]:
+            places = [torch.cat([point.theta, theta.new_zeros(len(theta) - len(point.theta))]) for point in points]
+            found = ratios(chain, theta, places, seed=self.seed)
+            against.update((id(point), one) for point, one in zip(points, found))
+            return [one.told_apart for one in found]
+
+        equal = rivals(course, told_apart)
+        if not (self.polish and chain.comparable and isinstance(field, GlobalField)):
+            return equal, {}, {}
+        how: dict[str, Any] = dict(omega=omega, steps=self.polish, stay=self.stay, seed=self.seed, log=log)
+        verdicts = compared(chain, field, theta, **how)
+        verdicts += [other_end(field, end, against[id(end)]) for end in equal if end.way == "across"]
+        recordings = film_next(chain, theta, verdicts, seed=self.seed, log=log)
+        return equal, {verdict.model.name: verdict.odds for verdict in verdicts}, recordings
 
     def said(self, field: AbstractField, seen: Shown, log: Log) -> Told:
         """What the clip says around what was learned."""
@@ -363,12 +400,13 @@ class Learn:
         seen: Shown,
         said: Told,
         course: list[Point],
+        equal: list[Point],
         beyond: Beyond,
         omega: float,
         log: Log,
     ) -> dict[str, Interval]:
-        """Of every learned number; `course`: what was tried; `beyond`: what pictures do not show; `omega` of the
-        motion [1/s]."""
+        """Of every learned number; `course`: what was tried, `equal`: and does as well; `beyond`: what pictures do not
+        show; `omega` of the motion [1/s]."""
         unit = field.velocity_scale or 1.0
         speed = [float(v) / unit for v in field.velocity(theta)] if field.velocity_scale else []
         stiff = np.array([float(is_stiff(name)) for name in field.names])
@@ -381,7 +419,7 @@ class Learn:
             before=self.before(field),
             beyond=beyond.covariance(stiff, fast, seen.push, of_branches(field.names, values, omega)),
         )
-        return intervals(field, widened(after, course, seen.evidence, log))
+        return intervals(field, widened(after, course, equal, log))
 
     def width(self, name: str) -> float:
         """Of what is thought of a component of theta before the clip."""

@@ -20,6 +20,7 @@ BOTTOM = (
     "physics3d.warp_types",
     "physics3d.warp_start",
     "physics3d.clusters",
+    "physics3d.cores",
     "physics3d.trajectory",
     "physics3d.matter",
 )

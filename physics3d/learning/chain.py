@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,8 +19,11 @@ from physics3d.log import Log
 from physics3d.priors.base import AbstractPrior
 from physics3d.priors.estimators.base import AbstractEstimator
 from physics3d.scenes.base import Capture, Take
-from physics3d.solver import motion_of
+from physics3d.solver import Motion, motion_of
 from physics3d.world import World
+
+LONGER = 3.0  # than the clip, is what could be filmed next
+PULL = 1 / 3  # of the force of a push, that pulls steadily
 
 
 def chain_of(
@@ -59,19 +63,23 @@ def chain_of(
     at = (indices // step).tolist()
 
     part = lambda values: world.material.per_part(values, body.part, body.parts)
-    motion = motion_of(
-        world,
-        rest,
-        volume,
-        excitation=(*body.held, *(take.excitation or ())),
-        part=part,
-        matter=body.matter,
-        device=device,
-        log=log,
-    )
-    timing = dict(frames=at[-1] + 1, frame_dt=step / take.fps)
     first = part(field.parameters(field.zero()))
-    motion = motion.settled(first, velocity=field.velocity(field.zero()), **timing)
+
+    def moved(excitation: tuple[AbstractBoundary, ...], timing: dict[str, Any], log: Log) -> Motion:
+        motion = motion_of(
+            world,
+            rest,
+            volume,
+            excitation=(*body.held, *excitation),
+            part=part,
+            matter=body.matter,
+            device=device,
+            log=log,
+        )
+        return motion.settled(first, velocity=field.velocity(field.zero()), **timing)
+
+    timing: dict[str, Any] = dict(frames=at[-1] + 1, frame_dt=step / take.fps)
+    motion = moved(take.excitation or (), timing, log)
     motion.report(first)
 
     def simulate(theta: Tensor):
@@ -95,7 +103,19 @@ def chain_of(
         )
         return torch.stack([draw(motion.position[at[i]], motion.deformation[at[i]]) for i in frames.tolist()]).float()
 
+    def filmed(excitation: tuple[AbstractBoundary, ...], times: float):
+        def made():
+            slower = timing | dict(frame_dt=times * timing["frame_dt"])
+            other = motion if excitation == take.excitation else moved(excitation, slower, Log(None))
+            return lambda theta: other(
+                part(field.parameters(theta)), velocity=field.velocity(theta), log=Log(None), **slower
+            )
+
+        return made
+
     known = (*world.boundaries, *(take.excitation or ()))
+    seconds = int(indices[-1]) / take.fps
+    others = recordings(take.excitation or (), seconds)
     forced = _stronger(known, 1.0) != known
     return Chain(
         simulate=simulate,
@@ -104,9 +124,38 @@ def chain_of(
         prior=prior,
         estimator=estimator,
         pushed=pushed if forced else None,
+        recordings={name: filmed(excitation, times) for name, (excitation, times) in others.items()},
         on_grid=motion.modes is None,
         journal=Journal(log),
     )
+
+
+def recordings(
+    excitation: tuple[AbstractBoundary, ...], seconds: float
+) -> dict[str, tuple[tuple[AbstractBoundary, ...], float]]:
+    """What a person could film next of a thing that was filmed for so long [s], in words -> (what sets it going, how
+    many times as long it is filmed)."""
+    long = LONGER * seconds
+    found: dict[str, tuple[tuple[AbstractBoundary, ...], float]] = {
+        f"the same again, filmed for {long:.2g} s": (excitation, LONGER)
+    }
+    pushes = [b for b in excitation if isinstance(b, Impulse) and b.force is not None and any(map(float, b.force))]
+    if len(pushes) != 1:  # several together have no side
+        return found
+    push = pushes[0]
+    assert push.force is not None
+    x, y, z = map(float, push.force)
+    other = lambda **change: tuple(replace(b, **change) if b is push else b for b in excitation)
+    found["a push as strong, from another side"] = (
+        other(force=(-y, x, z) if math.hypot(x, y) > abs(z) else (z, x, y)),
+        1,
+    )
+    weight = PULL * math.hypot(x, y, z)
+    found[f"a steady pull of {weight:.2g} N where it was pushed, as by a weight on a thread, for {long:.2g} s"] = (
+        other(force=(PULL * x, PULL * y, PULL * z), duration=long),
+        LONGER,
+    )
+    return found
 
 
 def _stronger(boundaries: tuple[AbstractBoundary, ...], more: float) -> tuple[AbstractBoundary, ...]:

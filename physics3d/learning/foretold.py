@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from physics3d.cores import spread
 from physics3d.learning.free_motion import FreeMotion
 from physics3d.learning.identify import Swing
 from physics3d.learning.seen_modes import Sight
@@ -42,12 +43,14 @@ def foretold(
 
     back = inverse(moved)
     y, x = np.mgrid[: back.shape[0], : back.shape[1]].astype(np.float32)
-    here, picture, frames = motion.at(last), photograph.numpy(), []
-    for t in times:
-        u = sight.displacement(motion.at(float(t)) - here).astype(np.float32)
+    here, picture = motion.at(last), photograph.numpy()
+
+    def at(t: float) -> UInt8[np.ndarray, "h w 3"]:
+        u = sight.displacement(motion.at(t) - here)
         v = cv2.remap(u, x + back[..., 0], y + back[..., 1], cv2.INTER_LINEAR)
-        frames.append(torch.from_numpy(carried(picture, cv2.GaussianBlur(v, (0, 0), SMOOTH))))
-    return torch.stack(frames)
+        return carried(picture, cv2.GaussianBlur(v, (0, 0), SMOOTH))
+
+    return torch.from_numpy(np.stack(spread(at, times.tolist())))
 
 
 def has_stopped(

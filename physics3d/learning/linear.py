@@ -3,7 +3,7 @@
 For priors whose estimate does not depend on the noise: z0 - x0_hat is then a residual, as of any fit of a recording.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -84,28 +84,59 @@ def _shown(chain: Chain, theta: Tensor, seed: int, step: float) -> dict[str, Any
     for seen in _around(chain, motions, seed, step):
         J = seen.J.numpy()
         JJ, squares, count = JJ + seen.weight * J.T @ J, squares + (J**2).sum(0), count + len(J)
-        g = _gradient(chain, seen)
-        score, share = [], []
-        for video in seen.videos[1 : k + 1]:
-            change = (video - seen.videos[0]).double().cpu().numpy() / step
-            score.append((g * change).sum(-1))
-            share.append((change**2).sum(-1))
-        s, I = np.stack(score, -1), np.stack(share, -1)
-        # pixels that change at all; all of them where none does, as in a view that looks away
-        whole = I.sum((0, 3))
-        counts = whole > 1e-6 * float(whole.max()) if whole.any() else whole == 0
-        t, c = len(g), g.shape[-1]
-        residual = (g * counts[..., None]).transpose(0, 3, 1, 2).reshape(t * c, *counts.shape)
-        row, column = np.nonzero(counts)
-        block, number = blocks(row, column, correlation_length(residual))
-        summed = lambda values, counts=counts, block=block, number=number: np.stack(
-            [[np.bincount(block, f[counts, i], number) for i in range(k)] for f in values]
-        ).transpose(0, 2, 1)
-        scores.append(summed(s))
-        shares.append(summed(I))
+        first, *beside = seen.videos[: k + 1]
+        changes = ((video - first).double().cpu().numpy() / step for video in beside)
+        score, share = _in_blocks(_gradient(chain, seen), changes)
+        scores.append(score)
+        shares.append(share)
     push = np.linalg.pinv(JJ[:k, :k], hermitian=True) @ JJ[:k, k] if len(JJ) > k else np.zeros(k)
     evidence = dict(JJ=JJ[:k, :k].copy(), score=np.concatenate(scores, 1), share=np.concatenate(shares, 1))
     return dict(evidence=evidence, push=push, rms=np.sqrt(squares[:k] / max(count, 1)))
+
+
+def _in_blocks(
+    g: Float[np.ndarray, "t h w 3"], changes: Iterable[Float[np.ndarray, "t h w 3"]]
+) -> tuple[Float[np.ndarray, "t p k"], Float[np.ndarray, "t p k"]]:
+    """(scores, shares) of changes of a view's video, as of `Evidence`; g is the gradient by its colours."""
+    summed = [((g * change).sum(-1), (change**2).sum(-1)) for change in changes]
+    s, I = (np.stack(values, -1) for values in zip(*summed))
+    # pixels that change at all; all of them where none does, as in a view that looks away
+    whole = I.sum((0, 3))
+    counts = whole > 1e-6 * float(whole.max()) if whole.any() else whole == 0
+    t, c = len(g), g.shape[-1]
+    residual = (g * counts[..., None]).transpose(0, 3, 1, 2).reshape(t * c, *counts.shape)
+    row, column = np.nonzero(counts)
+    block, number = blocks(row, column, correlation_length(residual))
+    added = lambda values: np.stack(
+        [[np.bincount(block, f[counts, i], number) for i in range(s.shape[-1])] for f in values]
+    ).transpose(0, 2, 1)
+    return added(s), added(I)
+
+
+def apart(chain: Chain, theta: Tensor, others: Sequence[Tensor], *, seed: int) -> list[Evidence]:
+    """What the residuals at theta say of the difference to each of the others, as of a derivative: k = 1."""
+    told = chain.journal.ask("apart", theta, *others, seed, answer=lambda: _apart(chain, theta, others, seed))
+    return [Evidence(**one) for one in told]
+
+
+def _apart(chain: Chain, theta: Tensor, others: Sequence[Tensor], seed: int) -> list[dict[str, Any]]:
+    with torch.no_grad():
+        places = chain.journal.log.progress((theta, *others), "comparing with what else was tried")
+        motions = [chain.simulate(place) for place in places]
+    square = np.zeros(len(others))
+    scores: list[list[np.ndarray]] = [[] for _ in others]
+    shares: list[list[np.ndarray]] = [[] for _ in others]
+    for i, motion in enumerate(motions[1:]):  # one at a time: videos are large
+        for seen in _around(chain, [motions[0], motion], seed, 1.0):
+            square[i] += seen.weight * float((seen.J**2).sum())
+            change = (seen.videos[1] - seen.videos[0]).double().cpu().numpy()
+            score, share = _in_blocks(_gradient(chain, seen), [change])
+            scores[i].append(score)
+            shares[i].append(share)
+    return [
+        dict(JJ=square[i, None, None].copy(), score=np.concatenate(scores[i], 1), share=np.concatenate(shares[i], 1))
+        for i in range(len(others))
+    ]
 
 
 def _motions(chain: Chain, theta: Tensor, step: float) -> list[Any]:

@@ -11,7 +11,7 @@ nothing.
 All that takes long is asked of the chain's journal, so that a learning that was stopped goes on where it was.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -41,6 +41,8 @@ class Chain:
     estimator: AbstractEstimator = field(default_factory=ScoreDistillation)
     # theta [k], ln of a factor on every known force -> trajectory; None: no force is known that drives the motion
     pushed: Callable[[Tensor, float], Any] | None = None
+    # what could be filmed next, in words -> what makes its motions by theta, of as many frames; takes time when called
+    recordings: Mapping[str, Callable[[], Callable[[Tensor], Any]]] = field(default_factory=dict)
     on_grid: bool = True  # whether a grid moves the body, whose resolution a stiffness then hangs on
     journal: Journal = field(default_factory=lambda: Journal(Log(None)))
 

@@ -21,7 +21,7 @@ from physics3d.learning.fields import GlobalField
 from physics3d.trajectory import Trajectory
 
 NAMES = ("youngs_modulus", "branch_shear_modulus", "shear_relaxation_time")
-NEAR = 1.6  # x or 1/x up to which both sides are one
+NEAR = 1.6  # x or 1/x up to which both sides are one, and a factor between times that are
 AWAY = 3.0  # then so far to either side
 LEAST = 0.1  # of E, that is left of it
 

@@ -2,45 +2,38 @@
 
 An interval from derivatives at the answer knows one valley of the loss. A thing that swings five times in a clip of a
 few frames has a valley for every number of swings that fits between them, and where the model draws the thing badly
-none of them is deep. With n independent looks at residuals of unknown size, and losses L,
-
-    n ln(L_tried/L_found) < chi^2_1(0.9)        the tried one lies within the 90 % that a likelihood ratio leaves
-
-(Wilks 1938, the variance profiled out). A rival outside the local interval is another valley; it stands for all that is
-nearer to it than to what else was tried, and intervals reach as far as that. One in which a polish ended (`mirror.py`)
-is a valley as wide as that of the answer. (A search whose steps skip whole valleys
-may have skipped the best: where swings are aliased 90 % hold 75 % of the truths, and without rivals 3 %.)
+none of them is deep. What the clip does not tell from the answer (`likelihood.py`) is a rival. One outside the local
+interval is another valley; it stands for all that is nearer to it than to what else was tried, and intervals reach as
+far as that. One in which a polish ended (`mirror.py`) is a valley as wide as that of the answer. (A search whose steps
+skip whole valleys may have skipped the best: where swings are aliased 90 % hold 75 % of the truths, and without rivals
+3 %.)
 """
 
-import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy import stats
+import torch
 
 from physics3d.learning.course import Point
 from physics3d.learning.interval import Posterior
-from physics3d.learning.sandwich import CERTAIN, NORMAL, Evidence, spread
+from physics3d.learning.sandwich import NORMAL
 from physics3d.log import Log
 
-BOUND = float(stats.chi2.ppf(CERTAIN, 1))
+FAR = 10.0  # times the loss of the answer: worse by so much that nobody looks
 
 
-def rivals(course: Sequence[Point], evidence: Evidence) -> list[Point]:
-    """Points of the search, and ends of other valleys, that do as well as the last of the course, as far as the
-    independent places and times of the evidence tell. Their losses, and the last one, are over all that was filmed."""
+def rivals(course: Sequence[Point], told_apart: Callable[[list[Point]], list[bool]]) -> list[Point]:
+    """Points of the search, and ends of other valleys, that do as well as the last of the course, as far as the clip
+    tells. Losses of those and of the last one are over all that was filmed."""
     tried = [point for point in course if point.way in ("search", "across")]
-    if not tried:
-        return []
-    known = spread(evidence)
-    looks = known.places * known.times
-    least = max(min(point.loss for point in (*tried, course[-1])), 1e-300)
-    return [point for point in tried if looks * math.log(max(point.loss, 1e-300) / least) < BOUND]
+    close = [point for point in tried if point.loss < FAR * max(course[-1].loss, 1e-300)]
+    different = [point for point in close if not torch.equal(point.theta, course[-1].theta)]
+    return [point for point, told in zip(different, told_apart(different), strict=True) if not told]
 
 
-def widened(found: Posterior, course: Sequence[Point], evidence: Evidence, log: Log) -> Posterior:
-    """`found`, its 90 % reaching as far as rivals do, or as what was thought before the clip."""
+def widened(found: Posterior, course: Sequence[Point], equal: Sequence[Point], log: Log) -> Posterior:
+    """`found`, its 90 % reaching as far as the rivals `equal` do, or as what was thought before the clip."""
     deviation = np.sqrt(found.covariance.diagonal())
     low, high = found.mean - NORMAL * deviation, found.mean + NORMAL * deviation
 
@@ -51,7 +44,6 @@ def widened(found: Posterior, course: Sequence[Point], evidence: Evidence, log: 
     tried = np.array([padded(point) for point in course if point.way == "search"]).reshape(-1, len(low))
     tried = np.unique(tried, axis=0)
     varied = np.ptp(tried, axis=0) > 0 if len(tried) else np.zeros(len(low), bool)
-    equal = rivals(course, evidence)
     ends = [padded(point) for point in equal if point.way == "across"]
     others = [padded(point) for point in equal if point.way == "search"]
     others = [other for other in others if ((other < low) | (other > high))[varied].any()]

@@ -49,6 +49,7 @@ class Spread:
 
     B: Float[np.ndarray, "k k"]
     student: Float[np.ndarray, " k"]  # factor on a standard deviation that makes a normal quantile Student's
+    freedom: Float[np.ndarray, " k"]  # degrees of freedom by which B is known
     places: float  # effective blocks of pixels, of the parameter that has fewest
     times: float  # and of frames
     frames: int  # in a block of frames
@@ -72,8 +73,15 @@ def spread(evidence: Evidence) -> Spread:
     freedom = np.sum([variance(X) ** 2 / np.maximum(count - 1, 1.0) for X, count in parts], axis=0)
     total = np.sum([X for X, _ in parts], axis=0)
     freedom = np.where(freedom > 0, variance(total) ** 2 / np.maximum(freedom, 1e-300), np.inf)
-    student = stats.t.ppf(0.5 + CERTAIN / 2, np.maximum(freedom, 1.0)) / NORMAL
-    return Spread(B=total, student=student, places=float(places.min()), times=float(times.min()), frames=length)
+    freedom = np.maximum(freedom, 1.0)
+    return Spread(
+        B=total,
+        student=stats.t.ppf(0.5 + CERTAIN / 2, freedom) / NORMAL,
+        freedom=freedom,
+        places=float(places.min()),
+        times=float(times.min()),
+        frames=length,
+    )
 
 
 def effective(share: Float[np.ndarray, "b k"]) -> Float[np.ndarray, " k"]:

@@ -12,6 +12,7 @@ pixels, weighted by how far the flow can be trusted (`motion/flow.py`),
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -40,14 +41,17 @@ class Sight:
 
     def displacement(self, q: Float[np.ndarray, " m"]) -> Float[np.ndarray, "h w 2"]:
         """What the amplitudes [m] move every pixel by [px]; beyond the outline that of the nearest pixel fades out."""
-        h, w = self.thing.shape
-        sparse = np.zeros((h, w, 2), np.float32)
-        marked = np.ones((h, w), bool)
-        sparse[tuple(self.pixel.T)] = self.jacobian @ q
-        marked[tuple(self.pixel.T)] = False
-        _, nearest = ndimage.distance_transform_edt(marked, return_indices=True)
+        nearest, fading = self._spread
+        return (self.jacobian @ q).astype(np.float32)[nearest] * fading
+
+    @cached_property
+    def _spread(self) -> tuple[Int[np.ndarray, "h w"], Float[np.ndarray, "h w 1"]]:
+        """(number of the pixel looked at that is nearest to each pixel, how much of its motion is left there)."""
+        number = np.full(self.thing.shape, -1)
+        number[tuple(self.pixel.T)] = np.arange(len(self.pixel))
+        nearest = ndimage.distance_transform_edt(number < 0, return_distances=False, return_indices=True)
         away = ndimage.distance_transform_edt(~self.thing)
-        return sparse[tuple(nearest)] * np.exp(-((away / FADE) ** 2))[..., None].astype(np.float32)
+        return number[tuple(nearest)], np.exp(-((away / FADE) ** 2))[..., None].astype(np.float32)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,7 +122,7 @@ def observe(
     i, j = sight.pixel.T
     W, U, J = weight[:, i, j].astype(float), u[:, i, j].astype(float), sight.jacobian
     flat = J.reshape(-1, J.shape[-1])
-    gram = np.stack([flat.T @ (np.repeat(w, 2)[:, None] * flat) for w in W])
+    gram = np.stack([_gram(np.sqrt(np.repeat(w, 2))[:, None] * flat) for w in W])
     right = (W[..., None] * U).reshape(len(U), -1) @ flat
     observed = Observed(
         gram=gram,
@@ -128,3 +132,8 @@ def observe(
         fps=fps,
     )
     return observed, u, W
+
+
+def _gram(A: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "m m"]:
+    """A^T A; NumPy sees that both are one matrix and computes half of it."""
+    return A.T @ A

@@ -4,13 +4,22 @@ import numpy as np
 from jaxtyping import UInt8
 from torch import Tensor
 
-from physics3d.metrics.image import ms_ssim, psnr, ssim
-from physics3d.metrics.motion import Oscillation, flow_error, motion_psnr, oscillation, phase_error, signal
+from physics3d.metrics.image import likeness, mean
+from physics3d.metrics.motion import (
+    Oscillation,
+    dominant,
+    flow_error,
+    motion_psnr,
+    oscillation,
+    phase_error,
+    signal,
+)
 from physics3d.metrics.video import vmaf
 from physics3d.motion.flow import flow
 from physics3d.motion.shapes import moving
 
 Cells = dict[str, tuple[float | None, str]]  # measure -> (number, "") or (None, why there is none)
+Lines = dict[str, list[float]]  # measure -> number of every frame
 STILL = "the reference moves by less than half a pixel"
 
 
@@ -24,6 +33,7 @@ class Reference:
         self.swing: Oscillation | None = None
         self.why = STILL
         if self.where is not None:
+            self.pattern = dominant(self.u, self.where)
             self.swing, self.why = self._swing(self.u)
 
     def itself(self) -> tuple[Cells, str]:
@@ -32,12 +42,15 @@ class Reference:
             return self._cells(None, STILL), ""
         return self._cells(self.swing, ""), self.why
 
-    def measure(self, clip: UInt8[Tensor, "t h w 3"]) -> tuple[Cells, str]:
-        """Every measure, and why the clip has no oscillation if so. Raises ValueError for unequal shapes."""
-        cells: Cells = {"psnr": (psnr(clip, self.clip), ""), "ssim": (ssim(clip, self.clip), "")}
-        cells |= {"ms_ssim": ms_ssim(clip, self.clip), "vmaf": vmaf(clip, self.clip)}
+    def measure(self, clip: UInt8[Tensor, "t h w 3"]) -> tuple[Cells, Lines, str]:
+        """Every measure, those that every frame has, and why the clip has no oscillation if so. Raises ValueError for
+        unequal shapes."""
+        like = likeness(clip, self.clip)
+        many = None if like.ms_ssim is None else mean(like.ms_ssim)
+        cells: Cells = {"psnr": (like.psnr, ""), "ssim": (mean(like.ssim), ""), "ms_ssim": (many, like.why)}
+        cells["vmaf"] = vmaf(clip, self.clip)
         motion, why = self.motion(clip)
-        return cells | motion, why
+        return cells | motion, {"PSNR [dB]": like.psnr_per_frame, "SSIM": like.ssim}, why
 
     def motion(self, clip: UInt8[Tensor, "t h w 3"]) -> tuple[Cells, str]:
         """The measures of the motion alone."""
@@ -51,7 +64,7 @@ class Reference:
 
     def _swing(self, u: np.ndarray) -> tuple[Oscillation | None, str]:
         assert self.where is not None
-        return oscillation(signal(u, self.u, self.where), self.fps)
+        return oscillation(signal(u, self.pattern, self.where), self.fps)
 
     def _cells(self, found, why: str) -> Cells:
         if found is None:

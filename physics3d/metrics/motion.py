@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from physics3d.metrics.image import check_pair, decibel
+from physics3d.metrics.image import check_pair, decibel, per_frame
 from physics3d.motion.decay import fit_decay
 
 CHANGE = 0.1  # of 0..1: a pixel that differs by more has changed
@@ -36,15 +36,19 @@ class Oscillation:
 
 def motion_psnr(video: UInt8[Tensor, "t h w 3"], reference: UInt8[Tensor, "t h w 3"]) -> tuple[float | None, str]:
     """(PSNR [dB] over the pixels that moved in the reference, "") or (None, reason). ValueError for unequal shapes."""
+    import cv2
+
     check_pair(video, reference)
-    total, count = 0.0, 0
-    for a, b in zip(video, reference):
-        moved = (b.float() - reference[0].float()).abs().amax(-1) > CHANGE * 255
-        total += float(((a[moved].double() - b[moved].double()) ** 2).sum()) / 255**2
-        count += 3 * int(moved.sum())
-    if count == 0:
+    first = reference[0].cpu().numpy()
+
+    def summed(a: np.ndarray, b: np.ndarray) -> tuple[float, int]:
+        moved = (cv2.absdiff(b, first) > CHANGE * 255).any(-1).astype(np.uint8)
+        return cv2.norm(a, b, cv2.NORM_L2SQR, mask=moved) / 255**2, 3 * int(moved.sum())
+
+    totals, counts = zip(*per_frame(video, reference, summed))
+    if sum(counts) == 0:
         return None, f"no pixel of the reference changes by more than {CHANGE:g}: it does not move"
-    return decibel(total / count), ""
+    return decibel(sum(totals) / sum(counts)), ""
 
 
 def flow_error(u: np.ndarray, u_ref: np.ndarray, where: np.ndarray) -> float:
@@ -52,12 +56,17 @@ def flow_error(u: np.ndarray, u_ref: np.ndarray, where: np.ndarray) -> float:
     return float(np.linalg.norm(u[:, where] - u_ref[:, where]) / np.linalg.norm(u_ref[:, where]))
 
 
-def signal(u: np.ndarray, u_ref: np.ndarray, where: np.ndarray) -> Float[np.ndarray, " t"]:
-    """Displacement along the reference's dominant pattern [px], its largest reference value positive."""
-    flat = u_ref[:, where].reshape(len(u_ref), -1)
-    pattern = np.linalg.svd(flat, full_matrices=False)[2][0]
-    s_ref = flat @ pattern
-    pattern = pattern * np.sign(s_ref[np.abs(s_ref).argmax()]) / math.sqrt(where.sum())
+def dominant(u: np.ndarray, where: np.ndarray) -> Float[np.ndarray, " n"]:
+    """The pattern of motion that most of a flow is, over the pixels `where`; its largest signal is positive."""
+    flat = u[:, where].reshape(len(u), -1)
+    pattern = np.linalg.eigh((flat @ flat.T).astype(float))[1][:, -1] @ flat  # by way of the small side
+    pattern /= np.linalg.norm(pattern)
+    s = flat @ pattern
+    return pattern * np.sign(s[np.abs(s).argmax()]) / math.sqrt(where.sum())
+
+
+def signal(u: np.ndarray, pattern: np.ndarray, where: np.ndarray) -> Float[np.ndarray, " t"]:
+    """Displacement along the dominant pattern of the reference [px]."""
     return u[:, where].reshape(len(u), -1) @ pattern
 
 

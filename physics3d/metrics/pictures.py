@@ -28,18 +28,20 @@ def slices(names: list[str], clips: list[UInt8[Tensor, "t h w 3"]], row: int, co
 
 def busiest(clip: UInt8[Tensor, "t h w 3"]) -> tuple[int, int]:
     """The row and the column of pixels that change most from the first frame."""
-    moved = (clip.float() - clip[0].float()).abs().sum((0, 3))
+    moved = sum((frame.int() - clip[0].int()).abs().sum(2) for frame in clip)
     return int(moved.sum(1).argmax()), int(moved.sum(0).argmax())
 
 
 def curves(values: dict[str, dict[str, list[float]]], fps: float, *, first: int):
-    """Measure -> (clip -> value per frame): one panel per measure, frames counted from `first`, time in s."""
+    """Clip -> (measure -> value per frame): one panel per measure, frames counted from `first`, time in s."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(5.5 * len(values), 3.2), layout="constrained")
-    for i, (measure, lines) in enumerate(values.items()):
-        axis = figure.add_subplot(1, len(values), i + 1)
-        for name, line in lines.items():
+    measures = next(iter(values.values()))
+    figure = Figure(figsize=(5.5 * len(measures), 3.2), layout="constrained")
+    for i, measure in enumerate(measures):
+        axis = figure.add_subplot(1, len(measures), i + 1)
+        for name, lines in values.items():
+            line = lines[measure]
             axis.plot([(first + k) / fps for k in range(len(line))], line, lw=1.2, label=name)
         axis.set(xlabel="time [s]", title=measure)
         axis.legend(frameon=False, fontsize=8)

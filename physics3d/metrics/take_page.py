@@ -14,7 +14,7 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from physics3d.log import Log
-from physics3d.metrics.image import psnr_per_frame, ssim_per_frame
+from physics3d.metrics.against import Lines
 from physics3d.metrics.pictures import busiest, curves, slices
 from physics3d.metrics.scores import markdown_table
 from physics3d.pictures import contact_sheet, titled
@@ -34,6 +34,7 @@ def take_page(
     fps: float,
     clips: dict[str, UInt8[Tensor, "n h w 3"]],
     scores: dict[str, dict[str, float | None]],
+    lines: dict[str, Lines],
     *,
     seen: int,
     said: list[str],
@@ -43,7 +44,7 @@ def take_page(
 ) -> None:
     """Writes the files above, if the log keeps files. `clips`: predictions of the frames from `seen` on, by name;
     `best`: the one that is shown; `bar`: the one that it is measured against; `scores`: name -> measure -> value;
-    `said`: sentences about the take."""
+    `lines`: of every frame; `said`: sentences about the take."""
     if log.folder is None:
         return
     past, future = recorded[:seen], recorded[seen:]
@@ -53,10 +54,6 @@ def take_page(
     log.image(f"{name}_frames", contact_sheet(torch.cat([came, told, apart], 1), columns=SHOWN, count=SHOWN))
     whole = {"recorded": recorded} | {key: torch.cat([past, clips[key]]) for key in (best, bar)}
     log.image(f"{name}_slices", slices(list(whole), list(whole.values()), *busiest(recorded), mark=seen))
-    lines = {
-        "PSNR [dB]": {key: psnr_per_frame(clip, future) for key, clip in clips.items()},
-        "SSIM": {key: ssim_per_frame(clip, future) for key, clip in clips.items()},
-    }
     log.image(f"{name}_curves", curves(lines, fps, first=seen))
     text = [f"# {name}", "", f"{seen} of {len(recorded)} frames at {fps:g} fps were seen; what follows was foretold."]
     text += ["", *(f"- {sentence}" for sentence in said), "", markdown_table(scores), ""]

@@ -13,6 +13,8 @@ what moves is before what stands. What is uncovered starts from -u(y), and shows
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from physics3d.motion.flow import size
+
 STEPS = 8
 MOVED = 0.5  # less needs no start of its own [px]
 
@@ -40,10 +42,10 @@ def inverse(u: Float[np.ndarray, "h w 2"]) -> Float[np.ndarray, "h w 2"]:
 def _arrivals(u: Float[np.ndarray, "h w 2"]) -> Float[np.ndarray, "h w 2"]:
     """-u of the pixel that arrives at each, and where none does the pixel's own -u. Where the motion tears, what lies
     in between would be drawn out over the gap: it does not arrive."""
-    v, size = -u, np.linalg.norm(u, axis=-1)
+    v, far = -u, size(u)
     torn = sum(slope**2 for part in (u[..., 0], u[..., 1]) for slope in np.gradient(part)) > 1
-    i, j = np.nonzero((size > MOVED) & ~torn)
-    farthest_last = np.argsort(size[i, j], kind="stable")
+    i, j = np.nonzero((far > MOVED) & ~torn)
+    farthest_last = np.argsort(far[i, j], kind="stable")
     i, j = i[farthest_last], j[farthest_last]
     for down, right in ((0, 0), (0, 1), (1, 0), (1, 1)):  # the four pixels that it lies between
         y = np.floor(i + u[i, j, 1]).astype(int) + down

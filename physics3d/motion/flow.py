@@ -26,9 +26,17 @@ def flow(video: UInt8[Tensor, "t h w 3"], *, reference: int = 0) -> Float[np.nda
     for side in (range(reference + 1, len(grey)), range(reference - 1, -1, -1)):
         last = None
         for t in side:
-            last = method.calc(grey[reference], grey[t], None if last is None else last.copy())
+            if np.array_equal(grey[t], grey[reference]):  # a picture that stands still costs nothing
+                last = np.zeros_like(fields[t])
+            else:
+                last = method.calc(grey[reference], grey[t], None if last is None else last.copy())
             fields[t] = last
     return fields
+
+
+def size(u: Float[np.ndarray, "*n h w 2"]) -> Float[np.ndarray, "*n h w"]:
+    """|u| [px]."""
+    return np.sqrt(u[..., 0] ** 2 + u[..., 1] ** 2)  # several times faster than a norm along the last axis
 
 
 def trust(

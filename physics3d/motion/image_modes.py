@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from physics3d.cores import spread
 from physics3d.motion.carry import carried, inverse
 from physics3d.motion.decay import Decay, with_start
 from physics3d.motion.flow import flow, trust
@@ -50,7 +51,7 @@ class ImageModes:
     def frames(self, indices: range) -> UInt8[Tensor, "t h w 3"]:
         """The predicted pictures."""
         picture = self.photograph.numpy()
-        return torch.stack([torch.from_numpy(carried(picture, self.displacement(i))) for i in indices])
+        return torch.from_numpy(np.stack(spread(lambda i: carried(picture, self.displacement(i)), indices)))
 
 
 def image_modes(seen: UInt8[Tensor, "t h w 3"], fps: float, *, count: int = 6, most: int = 5) -> ImageModes:

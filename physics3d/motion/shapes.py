@@ -16,6 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from physics3d.motion.flow import size
+
 STILL = 0.1  # of the largest displacement: pixels that move less are not in M
 LEAST = 0.5  # a clip in which no pixel moves by so much stands still [px]
 SMOOTH = 2.0  # [px]
@@ -30,9 +32,9 @@ class Shapes:
 
 def moving(u: Float[np.ndarray, "t h w 2"]) -> Bool[np.ndarray, "h w"] | None:
     """M, or None if nothing moves (no pixel by half a pixel)."""
-    size = np.linalg.norm(u, axis=-1).max(0)
-    largest = float(np.percentile(size, 99.9))
-    return None if largest < LEAST else size > STILL * largest
+    farthest = size(u).max(0)
+    largest = float(np.percentile(farthest, 99.9))
+    return None if largest < LEAST else farthest > STILL * largest
 
 
 def shapes(

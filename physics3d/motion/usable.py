@@ -19,7 +19,7 @@ from torch import Tensor
 
 from physics3d.motion.clip import Clip
 from physics3d.motion.decay import Decay
-from physics3d.motion.flow import flow, greys, trust
+from physics3d.motion.flow import flow, greys, size, trust
 from physics3d.motion.release import free_decay
 from physics3d.motion.shapes import moving, shapes
 from physics3d.video import reduced
@@ -94,7 +94,7 @@ def check_clip(clip: Clip, *, box: tuple[float, float, float, float] | None = No
     full = torch.nn.functional.interpolate(torch.from_numpy(where)[None, None].float(), (h, w))[0, 0] > 0.5
     return Findings(
         where=full.numpy(),
-        largest=float(np.percentile(np.linalg.norm(u - u[rest], axis=-1), 99.9)) / factor,
+        largest=float(np.percentile(size(u - u[rest]), 99.9)) / factor,
         decay=decay,
         release=release,
         rest=rest,
@@ -151,8 +151,8 @@ def crosses_border(frames: Tensor, u: Float[np.ndarray, "t h w 2"]) -> bool:
 
     grey = np.stack([cv2.GaussianBlur(g.astype(np.float32), (0, 0), 1.5) for g in greys(frames)])
     change = np.abs(grey - grey[-1]).max(0)
-    size = np.linalg.norm(u, axis=-1).max(0)
-    usual = np.percentile(change[size > 0.5 * np.percentile(size, 99.9)], 90)
+    farthest = size(u).max(0)
+    usual = np.percentile(change[farthest > 0.5 * np.percentile(farthest, 99.9)], 90)
     edge = np.concatenate([change[:3].ravel(), change[-3:].ravel(), change[:, :3].ravel(), change[:, -3:].ravel()])
     return bool((edge > max(0.6 * usual, 10.0)).mean() > 0.01)
 

@@ -32,6 +32,7 @@ from physics3d.scenes.studio import Mesh
 from physics3d.scenes.synthetic import within
 from physics3d.world import World
 
+SAME = 1e-7  # distance of vertices that are one [m]
 TOLERANCE = 1e-5  # of the force out of balance, of the largest inertia of the motion
 MOST_ITERATIONS = 60
 SLOW = 20  # iterations after which a new tangent is factored
@@ -67,7 +68,8 @@ def meshed(solids: Sequence[Mesh], world: World, edge: float) -> Body:
     points: list[np.ndarray] = []
     faces: list[np.ndarray] = []
     for solid in solids:
-        surface = pyvista.make_tri_mesh(solid.vertices.astype(float), solid.faces).clean()
+        surface = pyvista.make_tri_mesh(solid.vertices.astype(float), solid.faces)
+        surface = surface.clean(tolerance=SAME, absolute=True)  # rounding parts what meets on an axis
         if surface.bounds[4] < plane:
             surface = surface.clip_closed_surface("z", origin=(0.0, 0.0, plane)).triangulate().clean()
         if surface.n_cells:

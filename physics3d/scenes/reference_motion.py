@@ -18,10 +18,12 @@ import numpy as np
 from jaxtyping import Float
 
 from physics3d.boundaries.base import AbstractBoundary
+from physics3d.open3d_import import open3d
 from physics3d.scenes.studio import Mesh
 from physics3d.world import World
 
 FOLDER = Path(__file__).parent / "motions"
+MOST = 4000  # material points
 ENOUGH = 2e-6  # largest displacement that the fields leave out [m]
 LENGTH = 0.01  # that makes a displacement of a deformation [m]
 
@@ -35,6 +37,16 @@ class Moved:
     place: Float[np.ndarray, "p 3"]  # at rest [m]
     position: Float[np.ndarray, "t p 3"]  # [m]
     deformation: Float[np.ndarray, "t p 3 3"]  # F [1]
+
+
+def evenly(place: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "q 3"]:
+    """MOST of the points at most, as far apart as can be: what is kept is to be small."""
+    if len(place) <= MOST:
+        return place
+    geometry, utility = open3d().geometry, open3d().utility
+    cloud = geometry.PointCloud(utility.Vector3dVector(place.astype(float)))
+    found = cloud.farthest_point_down_sample(MOST, 0)
+    return np.asarray(found.points).astype(place.dtype)
 
 
 def path_of(name: str) -> Path:

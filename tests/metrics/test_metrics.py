@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from physics3d.metrics.image import ms_ssim, psnr, ssim
-from physics3d.metrics.motion import flow_error, motion_psnr, oscillation, signal
+from physics3d.metrics.image import likeness, ms_ssim, psnr, ssim
+from physics3d.metrics.motion import dominant, flow_error, motion_psnr, oscillation, signal
 from physics3d.metrics.scores import Scores
 from physics3d.metrics.video import vmaf
 from physics3d.motion.flow import flow
@@ -39,6 +39,23 @@ def test_identical_clips_have_the_best_scores():
     assert ms_ssim(video, video)[0] == pytest.approx(1, abs=1e-5)
     assert vmaf(video, video)[0] > 0.95  # 0.998 on camera pictures; libvmaf v0.6.1 does not promise exactly 1
     assert motion_psnr(video, video)[0] == math.inf
+
+
+@pytest.mark.parametrize("h, w", [(176, 181), (193, 230)])
+@pytest.mark.parametrize("change", [lambda v: torch.roll(v, 3, 2), lambda v: v // 2 + 40, lambda v: 255 - v])
+def test_likeness_is_that_of_torchmetrics(change, h, w):
+    from torchmetrics.functional.image import multiscale_structural_similarity_index_measure as of_scales
+    from torchmetrics.functional.image import structural_similarity_index_measure as of_one
+
+    noise = torch.randint(0, 40, (3, h, w, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+    video = swinging(frames=3, h=h, w=w) // 2 + noise
+    found = likeness(change(video), video)
+    a, b = (clip.permute(0, 3, 1, 2).double() / 255 for clip in (change(video), video))
+    told = dict(data_range=1.0, reduction="none")
+    # float32: squares of colours to 1e-7, against c2 = 9e-4
+    assert found.ssim == pytest.approx(of_one(a, b, **told).tolist(), abs=2e-5)
+    assert found.ms_ssim == pytest.approx(of_scales(a, b, **told).tolist(), abs=2e-5)
+    assert found.psnr == pytest.approx(10 * math.log10(1 / float(((a - b) ** 2).mean())), abs=1e-9)
 
 
 def test_psnr_of_a_constant_offset_is_known():
@@ -88,7 +105,7 @@ def test_frequency_and_damping_of_a_swing_are_recovered_from_pixels():
     u_ref = flow(reference)
     where = moving(u_ref)
     for video, f, d in ((reference, 1.5, 1.0), (other, 2.0, 2.0)):
-        found, reason = oscillation(signal(flow(video), u_ref, where), FPS)
+        found, reason = oscillation(signal(flow(video), dominant(u_ref, where), where), FPS)
         assert reason == ""
         assert found.frequency == pytest.approx(f, rel=0.02)  # sub-pixel errors of the estimated flow
         assert found.damping == pytest.approx(d, rel=0.15)

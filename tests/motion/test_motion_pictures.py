@@ -5,7 +5,7 @@ import pytest
 import torch
 from clips import FPS, decaying, swaying, texture
 
-from physics3d.metrics.image import psnr, psnr_per_frame
+from physics3d.metrics.image import likeness, psnr
 from physics3d.motion.carry import carried, inverse
 from physics3d.motion.clip import read_clip
 from physics3d.motion.flow import flow, trust
@@ -138,8 +138,8 @@ def test_image_modes_beat_the_last_frame_seen_on_a_real_take(data):
     picks = range(seen, len(clip.frames), 6)
     future = clip.frames[torch.tensor(picks)]
     modes = image_modes(clip.frames[:seen], clip.fps)
-    gain = np.mean(psnr_per_frame(modes.frames(picks), future)) - np.mean(
-        psnr_per_frame(clip.frames[seen - 1].expand_as(future).contiguous(), future)
+    gain = np.mean(likeness(modes.frames(picks), future).psnr_per_frame) - np.mean(
+        likeness(clip.frames[seen - 1].expand_as(future).contiguous(), future).psnr_per_frame
     )
     assert gain > 8  # dB; a first attempt had 11.5 at full size
     main = modes.decay.main()

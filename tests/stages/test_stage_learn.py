@@ -96,7 +96,9 @@ def test_exact_pictures_leave_what_they_do_not_show():
     seen = Shown(evidence=exact, push=np.zeros(1), rms=np.ones(1))
     for grid in (0.278, 0.15, 0.0):
         said = stage.said(field, seen, Log(None))
-        told = stage.intervals(field, field.zero(), seen, said, [], Beyond(grid=grid), 0.0, Log(None))["youngs_modulus"]
+        told = stage.intervals(field, field.zero(), seen, said, [], [], Beyond(grid=grid), 0.0, Log(None))[
+            "youngs_modulus"
+        ]
         # the prior, 2.3 wide, takes a hundredth of it
         assert told.deviation == pytest.approx(math.sqrt(0.0325 + grid**2), rel=0.02)
         assert told.low * told.high == pytest.approx(7e3**2, rel=1e-6)
