@@ -7,6 +7,7 @@ are far more than particles; then the particles are scattered again.
 
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import torch
@@ -34,7 +35,7 @@ class Adjoint:
         arrays, real = self.arrays, self.arrays.real
         vec3 = vector(real)
         self.states: list[State] = [arrays.new_state(), arrays.new_state()]
-        self._flat: list[wp.array] = [wp.from_torch(state.flat) for state in self.states]  # the same bytes
+        self._flat: list[Any] = [wp.from_torch(state.flat) for state in self.states]  # the same bytes
         self.v_pushed: wp.array | None = arrays.zeros(arrays.n, vec3) if arrays.v_pushed is not None else None
         self.coefficients: wp.array = arrays.zeros((arrays.row_count, arrays.n), real)
         self.offset: wp.array = arrays.zeros(arrays.n, vec3)

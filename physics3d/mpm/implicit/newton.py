@@ -1,6 +1,7 @@
 """Newton's method for an implicit step.
 
-The linear systems P^T (M + K) P d = -P^T r are solved without assembling K; C is taken symmetric, and a direction of
+The tangent of the step before serves as long as an iteration with it brings a digit. The linear systems
+P^T (M + K) P d = -P^T r are solved without assembling K; C is taken symmetric, and a direction of
 negative curvature ends the solve. The line search asks for the slope of the energy, r(v + a d) . d, which needs no
 energy. Where P is a projector Newton runs in its range, the active set taken anew in each iteration. Where it is none
 (sliding with friction) the system is not symmetric, and BiCGStab takes over. Convergence is judged by the residual
@@ -87,29 +88,36 @@ def solve(system: System, *, bounded: bool) -> Step:
         forcing = max(min(0.1, true), 0.3 * goal / size)
         d, used = _direction(system, tangent, constraints, residual, forcing * size)
         products += used
-        slope = dot(system.mass * residual, d)
-        a = 1.0
-        for _ in range(TRIES):
-            trial = v + a * d
-            trial_size, trial_slope = math.inf, math.inf
-            if system.forces(trial):
-                trial_residual = system.residual(trial)
-                trial_size, trial_slope = system.norm(trial_residual), dot(system.mass * trial_residual, d)
-            downhill = constraints.projectors and slope < 0 and trial_slope <= -0.5 * slope
-            if math.isfinite(trial_size) and (trial_size <= 0.9 * size or downhill):
-                v, residual, before, size = trial, trial_residual, size, trial_size
-                break
-            secant = slope / (slope - trial_slope) if slope < 0 < trial_slope < math.inf else 0.5
-            a *= min(max(secant, 0.1), 0.5)
-        else:
-            if size <= 30 * goal:
-                system.forces(v)
-                return Step(v, newton, products)
-            if not newly:  # the tangent was an old one
-                system.forces(v)
-                before = size
-                continue
+        found = _searched(system, constraints, v, d, residual)
+        if found is not None:
+            before, (v, residual, size) = size, found
+            continue
+        system.forces(v)
+        if size <= 30 * goal:
+            return Step(v, newton, products)
+        if newly:
             raise NotConverged(f"the line search of Newton iteration {newton} found no way down")
+        before = size  # the tangent was an old one, and is made anew
+
+
+def _searched(
+    system: System, constraints: Constraints, v: Tensor, d: Tensor, residual: Tensor
+) -> tuple[Tensor, Tensor, float] | None:
+    """Velocities on the way from v along d that are nearer to the root, their residual and its size; None if there are
+    none. The system is left at those that were tried last."""
+    size, slope, a = system.norm(residual), dot(system.mass * residual, d), 1.0
+    for _ in range(TRIES):
+        trial = v + a * d
+        trial_size, trial_slope = math.inf, math.inf
+        if system.forces(trial):
+            trial_residual = system.residual(trial)
+            trial_size, trial_slope = system.norm(trial_residual), dot(system.mass * trial_residual, d)
+        downhill = constraints.projectors and slope < 0 and trial_slope <= -0.5 * slope
+        if math.isfinite(trial_size) and (trial_size <= 0.9 * size or downhill):
+            return trial, trial_residual, trial_size
+        secant = slope / (slope - trial_slope) if slope < 0 < trial_slope < math.inf else 0.5
+        a *= min(max(secant, 0.1), 0.5)
+    return None
 
 
 def _direction(
