@@ -44,6 +44,7 @@ RESULTS = Path(__file__).resolve().parent.parent / "docs" / "results"
 UNSEEN = 20_000  # number of the first form: training takes 0, 1, ..., its own check 10000, ...
 SEED = 0
 FAR = math.log(4.0)
+SPAN = 5.0  # of the search: factors of a half to 2 from a start that is 4 off would land on the answer
 GRID = np.linspace(-1.75, 1.75, 29)
 STEP = 0.02  # of the central differences of a clip
 RANGES = ((1.0, 5.0), (3.0, 30.0), (10.0, 60.0))  # of sigma/alpha
@@ -262,9 +263,9 @@ def distil(
 
 
 def search(prior: AbstractPrior, condition: Any, twin: Twin, solver: Solver | None, start: float) -> float:
-    """The best of five factors from 1/4 to 4 on the start, all with the same noise."""
+    """The best of five factors from 1/SPAN to SPAN on the start, all with the same noise."""
     found = {}
-    for theta in start + np.linspace(-FAR, FAR, 5):
+    for theta in start + np.linspace(-math.log(SPAN), math.log(SPAN), 5):
         here = torch.tensor(theta, dtype=torch.float64)
         with torch.no_grad():
             clip = twin.clip(here) if solver is None else twin.solved(solver, here)
