@@ -1,6 +1,7 @@
 """How theta becomes a motion, a motion a clip, and which clips of a take it is compared with."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -20,6 +21,9 @@ from physics3d.priors.estimators.base import AbstractEstimator
 from physics3d.scenes.base import Capture, Take
 from physics3d.solver import motion_of
 from physics3d.world import World
+
+# positions, deformation gradients, number of the camera -> pictures [t, h, w, 3]
+Draw = Callable[[Tensor, Tensor, int], Tensor]
 
 
 def chain_of(
@@ -41,19 +45,8 @@ def chain_of(
 
     Pictures are drawn at `image_scale` of the take's size. Raises ValueError if all cameras are held out.
     """
-    views = [i for i in range(len(take.cameras)) if i not in take.held_out_cameras]
-    if not views:
-        raise ValueError(f"take {take.name}: all cameras are held out; leave one to learn from")
-    cameras = {i: take.cameras[i].scaled(image_scale) for i in views}
-    clips = {}
-    for i in views:
-        video = take.videos[i][indices].permute(0, 3, 1, 2).to(device, torch.float32) / 255
-        size = (cameras[i].height, cameras[i].width)
-        clips[i] = torch.nn.functional.interpolate(video, size, mode="area").permute(0, 2, 3, 1)
-    model, embedding = gaussians.to(device), body.embedding
     rest, volume = body.position.to(device), body.volume.to(device)
-    background = torch.tensor(capture.background, dtype=torch.float32, device=device)
-    backdrops = {i: Backdrop.of(model, embedding, cameras[i], background=background) for i in views}
+    clips, draw = filmed(capture, gaussians, body, take, indices, image_scale=image_scale, device=device)
     # rolled out at the largest step of which all frames are multiples
     step = math.gcd(*indices.tolist())
     at = (indices // step).tolist()
@@ -88,12 +81,8 @@ def chain_of(
         return stronger(part(field.parameters(theta)), velocity=field.velocity(theta), log=Log(None), **timing)
 
     def render(motion, view: int, frames: Tensor) -> Tensor:
-        draw = lambda x, F: (
-            render_deformed(
-                model, embedding, rest, x, F, cameras[view], background=background, backdrop=backdrops[view]
-            ).color
-        )
-        return torch.stack([draw(motion.position[at[i]], motion.deformation[at[i]]) for i in frames.tolist()]).float()
+        there = [at[i] for i in frames.tolist()]
+        return draw(motion.position[there], motion.deformation[there], view)
 
     known = (*world.boundaries, *(take.excitation or ()))
     forced = _stronger(known, 1.0) != known
@@ -107,6 +96,46 @@ def chain_of(
         on_grid=motion.modes is None,
         journal=Journal(log),
     )
+
+
+def filmed(
+    capture: Capture,
+    gaussians: Gaussians,
+    body: Body,
+    take: Take,
+    indices: Tensor,
+    *,
+    image_scale: float,
+    device: str,
+) -> tuple[dict[int, Tensor], Draw]:
+    """(clips by number of the camera, float [t, h, w, 3] of the frames `indices`; what draws positions [t, p, 3] and
+    deformation gradients [t, p, 3, 3] as such a camera sees them), at `image_scale` of the take's size.
+
+    Raises ValueError if all cameras are held out.
+    """
+    views = [i for i in range(len(take.cameras)) if i not in take.held_out_cameras]
+    if not views:
+        raise ValueError(f"take {take.name}: all cameras are held out; leave one to learn from")
+    cameras = {i: take.cameras[i].scaled(image_scale) for i in views}
+    clips = {}
+    for i in views:
+        video = take.videos[i][indices].permute(0, 3, 1, 2).to(device, torch.float32) / 255
+        size = (cameras[i].height, cameras[i].width)
+        clips[i] = torch.nn.functional.interpolate(video, size, mode="area").permute(0, 2, 3, 1)
+    model, embedding, rest = gaussians.to(device), body.embedding, body.position.to(device)
+    background = torch.tensor(capture.background, dtype=torch.float32, device=device)
+    backdrops = {i: Backdrop.of(model, embedding, cameras[i], background=background) for i in views}
+
+    def draw(position: Tensor, deformation: Tensor, view: int) -> Tensor:
+        pictures = [
+            render_deformed(
+                model, embedding, rest, x, F, cameras[view], background=background, backdrop=backdrops[view]
+            ).color
+            for x, F in zip(position, deformation)
+        ]
+        return torch.stack(pictures).float()
+
+    return clips, draw
 
 
 def _stronger(boundaries: tuple[AbstractBoundary, ...], more: float) -> tuple[AbstractBoundary, ...]:
