@@ -14,16 +14,15 @@ PROFILE=smoke takes minutes for a scene. `compare_page.py` says what is written.
 import sys
 from pathlib import Path
 
-from pipeline.compare_page import FIELD, FILMED, FROZEN, METRICS, Row, write
-from pipeline.filed import filed, one_line
+from pipeline.compare_page import FIELD, FILMED, FROZEN, METRICS, WHOLE, Row, write
+from pipeline.filed import one_line
+from pipeline.flow import Plan, first, plan
 from pipeline.places import folder_to_fill
 from pipeline.settings import SettingsError, choices
 from pipeline.shelf import using
 from pipeline.stage import StageError, Step, here, manifest, peek, run
 from pipeline.sweep import OWN, Variant, asked, swept
-from pipeline.told import Table, parameters, scores
-
-WHOLE = "physics3d"
+from pipeline.told import Parameter, Table, parameters, scores
 
 
 def main(words: list[str]) -> int:
@@ -57,7 +56,7 @@ def compare(words: list[str]) -> int:
             continue
         for method, make in ((variant.method, of_variant), (FIELD, deformed)):
             try:
-                rows += make(variant, rest)
+                rows += make(variant)
             except StageError as error:
                 lost[variant.scene, method] = str(error)
     if not rows:
@@ -67,11 +66,11 @@ def compare(words: list[str]) -> int:
     return 1 if lost else 0
 
 
-def of_variant(variant: Variant, rest: list[str]) -> list[Row]:
+def of_variant(variant: Variant) -> list[Row]:
     """The row of a run; with the whole method also those of what needs no run of its own."""
     from pipeline.moving import read
 
-    _, whole, steps = filed([f"scene={variant.scene}", f"method={variant.method}", *rest])
+    whole, steps = planned(variant)
     tables = scores(whole)
     if not tables:
         raise StageError(f"{variant.scene} has no recorded motion to compare with; leave it out of SCENES")
@@ -84,7 +83,7 @@ def of_variant(variant: Variant, rest: list[str]) -> list[Row]:
         method=variant.method,
         scores=_numbers(table, name),
         seconds=sum(_seconds(step) for step in steps.values() if not step.name.endswith("_initial")),
-        learned={p.name: f"{p.learned:.3g} ({p.between})" for p in parameters(whole) if p.low is not None},
+        learned={p.name: _found(p) for p in parameters(whole) if p.low is not None},
         video=read(steps["render"]).frames[0],
     )
     if not is_whole:
@@ -97,20 +96,33 @@ def of_variant(variant: Variant, rest: list[str]) -> list[Row]:
     return [filmed, *still, found]
 
 
+def planned(variant: Variant) -> tuple[Plan, dict[str, Step]]:
+    """Plan and steps by name of a variant whose steps are filed, by the configuration that they were computed with."""
+    shelf = Path(variant.config["output"]).expanduser().resolve() / "artifacts"
+    whole = plan(variant.config, first(variant.config, shelf))
+    return whole, {step.name: step for step in whole.steps}
+
+
 def _numbers(table: Table, row: str) -> dict[str, float]:
     return {k: v for k, v in table.values[row].items() if k in METRICS and v is not None}
+
+
+def _found(parameter: Parameter) -> str:
+    """What was learned, in words."""
+    truth = "" if parameter.truth is None else f"truth {parameter.truth:.3g}, "
+    return f"{parameter.learned:.3g} ({truth}{parameter.between})"
 
 
 def _seconds(step: Step) -> float:
     return float(manifest(step)["seconds"])
 
 
-def deformed(variant: Variant, rest: list[str]) -> list[Row]:
+def deformed(variant: Variant) -> list[Row]:
     """The row of the deformation field, fitted to the take that the others learned from, beside that of the whole
     method; none where there is no such take, or nobody knows what set it going."""
     from pipeline.moving import read
 
-    config, _, steps = filed([f"scene={variant.scene}", f"method={variant.method}", *rest])
+    config, (_, steps) = variant.config, planned(variant)
     if variant.method != WHOLE or "learn" not in steps or "evaluate" not in steps:
         return []
     device = here(config["device"])
