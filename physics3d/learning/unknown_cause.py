@@ -65,9 +65,7 @@ def swung(world: World, capture: Capture, gaussians: Gaussians, body: Body, *, z
     )
 
 
-def by_its_own_camera(
-    body: Swung, capture: Capture, take: Take, gaussians: Gaussians, rides: Body, log: Log
-) -> Swung:
+def by_its_own_camera(body: Swung, capture: Capture, take: Take, gaussians: Gaussians, rides: Body, log: Log) -> Swung:
     """Another take, whose camera and picture of the thing at rest are its own."""
     assert take.posed is not None
     seen = sight(gaussians, rides, found_by(capture, take, gaussians, log), body.model.values)
@@ -84,7 +82,7 @@ def found_by(capture: Capture, take: Take, gaussians: Gaussians, log: Log) -> Ca
     found = register(gaussians, camera, picture, standing(take.videos[0], picture), background=capture.background)
     log.info(
         f"{take.name}: its camera is refined by what stands still: what is in the middle of the picture moves by "
-        f"{found.moved:.1f} px, and pictures differ by {found.after:.3f} of the range of colours, {found.before:.3f} before"
+        f"{found.moved:.1f} px, and pictures differ by {found.after:.3f} of the colours, {found.before:.3f} before"
     )
     return found.camera
 

@@ -43,9 +43,7 @@ def swing():
     modes = Oscillations(
         shape=one, span=one, frequency=np.array([FPS / PERIOD]), damping=np.zeros(1), wide=np.zeros(2), power=1.0
     )
-    return Swing(
-        modes=modes, amplitude=np.array([[ANGLE, 0.0]]), rest=np.zeros(1), wide=np.zeros(2), unexplained=0.0
-    )
+    return Swing(modes=modes, amplitude=np.array([[ANGLE, 0.0]]), rest=np.zeros(1), wide=np.zeros(2), unexplained=0.0)
 
 
 def angles_at(frames):
