@@ -37,7 +37,7 @@ export PYTHONUTF8
 
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup run why sweep compare pin unpin collect score twin reference-motion train-prior fit-curves export still film report ui graph view test newest bench lint \
+.PHONY: help setup run why sweep compare pin unpin collect score twin reference-motion train-prior fit-curves export still film report ui graph view test newest bench bench-gpu lint \
 	handbook scenes configuration architecture clean
 py := .venv/bin/python
 # torch's own threads spin beside those of the renderer and the simulator: OMP_NUM_THREADS=1 unless you say otherwise
@@ -137,6 +137,10 @@ newest: ## the tests with the newest version of everything, in an environment of
 	@OMP_NUM_THREADS=1 .venv-newest/bin/python -m pipeline.words -m pytest -n 2 --dist loadfile
 
 bench: $(ready) bench-speed bench-renderer bench-filling bench-embedding bench-simulation bench-swaying bench-stability bench-segmentation bench-reconstruction bench-motion bench-real bench-learning bench-starts ## measurements with plots, into docs/results; one alone: make bench-<name>
+
+# no `make setup`: a Python with torch, Warp, numpy, scipy, matplotlib, jaxtyping and annotated-types is enough
+bench-gpu: ## simulator and renderer on a GPU, right and how fast, under 8 minutes: [DATA=<folder with lego>] [ARGS="device=cuda seed=0"]
+	@$(threads) "$$(test -x $(py) && echo $(py) || echo "$$PYTHON")" benchmarks/gpu.py $$ARGS $${DATA:+data="$$DATA"}
 
 bench-%: export BENCH = $*
 bench-%: $(ready)

@@ -25,6 +25,7 @@ from pathlib import Path
 import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "modes"))
+import implicit_cost
 import modes_bodies
 from known_answers import K_N, M_E, MU_N, PROBLEMS, Answer
 from machine import machine
@@ -180,6 +181,18 @@ def mark_front(rows: list[dict]) -> None:
         row["pareto"] = row["outcome"] == "ran" and not beaten
 
 
+def write_again() -> None:
+    """The page of the table that is there."""
+    rows = read()
+    page_of = RESULTS / "simulation.md"
+    head = next(line for line in page_of.read_text().splitlines() if line.startswith("Machine: "))
+    title = head.removeprefix("Machine: ").partition(". Shared")[0]
+    earlier = next((line for line in page_of.read_text().splitlines() if line.startswith("Of an earlier run")), "")
+    kept = earlier.rstrip(".").partition(": ")[2].split(", ") if earlier else []
+    mark_front(rows)
+    page_of.write_text(page(rows, title, kept))
+
+
 def read() -> list[dict]:
     """The rows of the table that is there."""
     table = RESULTS / "simulation.csv"
@@ -290,6 +303,7 @@ def page(rows: list[dict], title: str, kept: list[str]) -> str:
         numbers = [f"{r['substeps']}", f"{r['error']:.2e}", f"{r['seconds']:.3f}"] if ran else ["", "", ""]
         cells = [r["problem"], r["precision"], r["size"], r["step"], r["outcome"], *numbers, "*" if r["pareto"] else ""]
         lines.append("| " + " | ".join(cells) + " |")
+    lines += implicit_cost.table(implicit_cost.read())
     refused = next((r for r in rows if r["outcome"] == "refused"), None)
     if refused:
         lines += ["", f"A refusal reads: `{refused['reason']}`."]

@@ -1,19 +1,21 @@
-"""Cost of the simulator and the renderer, forward and with adjoint, against size; compilation; memory; a peer beside.
+"""Cost of simulator and renderer, forward and with adjoint, against size and cores; compilation; memory; a peer.
 
-    python benchmarks/speed.py [device=cpu] [seed=0] [peers=/path/to/python]   ->   docs/results/speed_<device>.*
+    python benchmarks/speed.py [seed=0] [peers=/path/to/python] [most=1000000]   ->   docs/results/speed_cpu.*
 
-A body is a jittered cube, 8 particles per cell, in a little motion, float32; times are the best of three after a
-warm-up, that of a long run minus that of a short one, so that setting up a rollout does not count. `empty cells` is
+A body is a jittered cube, 8 particles per cell, in a little motion, float32. A cost is the median slope of time over
+four lengths of a run, each run several times in turn, with half the distance of the quartiles as its spread
+(`slopes.py`), so that setting up a rollout does not count. Time is processor time on one thread, which other work on
+the machine hardly changes, and wall clock on two, which it does: two are measured where the load is one at most. Rows
+that contradict each other beyond their spreads end the command with an error, and nothing is written. `empty cells` is
 a body with two lone particles beside it, near or so far away that the box around all has 8 times the nodes. `resident`
 is what the process holds while it simulates, less what it held before. Compilation is that of a first rollout on an
 empty kernel cache, less that of a second one. `peers` names a Python that has Taichi; its own example mpm3d (one
-pressure per particle, no solid) runs there with the same number of particles, on 64^3 nodes and all cores, between our
-rows.
+pressure per particle, no solid) runs there with the same number of particles, on 64^3 nodes, in the same run. A GPU is
+measured by `make bench-gpu`.
 """
 
 import csv
 import json
-import math
 import os
 import statistics
 import subprocess
@@ -24,8 +26,8 @@ import time
 from pathlib import Path
 
 import torch
-import warp as wp
 from machine import machine
+from slopes import contradictions, slope
 
 from physics3d.gaussians.cameras import Camera, look_at
 from physics3d.gaussians.rasterize import rasterize
@@ -45,6 +47,9 @@ START = {
     "youngs_modulus": 1e5, "poissons_ratio": 0.3, "branch_shear_modulus": 2e4, "branch_bulk_modulus": 4e4,
     "shear_relaxation_time": 0.1, "bulk_relaxation_time": 0.1,
 }  # fmt: skip
+SIMPLER = (("fixed corotated", "viscoelastic, one branch"),)
+UNSURE = 0.5
+QUIET = 1.0  # load of the machine above which a second thread is not measured
 PER_SUBSTEP = "ns per particle and substep"
 
 
@@ -54,33 +59,50 @@ def main(words: list[str]) -> None:
     if "compile" in options:
         print(json.dumps(first_rollout(options["compile"], device)))
         return
-    cuda = device.startswith("cuda")
+    if device != "cpu":
+        sys.exit("error: this is for a CPU; make bench-gpu measures a GPU")
+    most, begun = int(options.get("most", 1_000_000)), os.getloadavg()[0]
+    cores = (1, 2) if begun <= QUIET else (1,)
     rows: list[dict] = []
 
     def keep(*more: dict) -> None:
         rows.extend(more)
-        for row in more:
-            print(f"{row['what']}, {row['size']}: {row['value']:.4g} {row['unit']}", flush=True)
-        write(rows, device, seed)
+        for r in more:
+            print(f"{named(r)}: {r['value']:.4g} +- {r['spread']:.2g} {r['unit']}", flush=True)
 
     for name in MATERIALS:
         keep(compilation(name, device))
-    for count in (10_000, 100_000, 1_000_000) if cuda else (1_000, 10_000, 100_000):
+    for count in (1_000, 10_000, 100_000):
         for name in MATERIALS:
-            keep(*simulation(name, count, device, seed))
-        if peers and count == 100_000:
-            keep(*taichi(peers, count))
-    if not cuda:
-        keep(*simulation("fixed corotated", 1_000_000, device, seed, backward=False))
-    keep(*empty_cells(device, seed))
-    for count, side in ((20_000, 320), (50_000, 400), *(((500_000, 800),) if cuda else ())):
+            for threads in cores:
+                if count <= most:
+                    keep(*simulation(name, count, threads, seed))
+        if peers and count == 100_000 <= most:
+            for threads in cores:
+                keep(*taichi(peers, count, threads))
+    if most >= 1_000_000:
+        for threads in cores:
+            keep(*simulation("fixed corotated", 1_000_000, threads, seed, backward=False))
+    keep(*empty_cells(seed))
+    for count, side in ((20_000, 320), (50_000, 400)):
         keep(*rendering(count, side, device, seed))
     if not peers:
         print("no peer: peers=/path/to/python of an environment with Taichi")
+    wrong = contradictions(rows, simpler=SIMPLER)
+    if wrong:
+        sys.exit("error: nothing is written, for rows contradict each other:\n" + "\n".join(wrong))
+    write(rows, device, seed, (begun, os.getloadavg()[0]))
 
 
-def row(what: str, size: int, value: float, unit: str) -> dict:
-    return dict(what=what, size=size, value=value, unit=unit)
+def row(
+    what: str, kind: str, size: int, value: float, unit: str, *, spread: float = 0.0, threads: int | str = ""
+) -> dict:
+    return dict(what=what, kind=kind, size=size, threads=threads, value=value, spread=spread, unit=unit)
+
+
+def named(r: dict) -> str:
+    threads = f", {r['threads']} thread{'s' if r['threads'] == 2 else ''}" if r["threads"] else ""
+    return f"{r['what']}, {r['kind']}, {r['size']}{threads}"
 
 
 def cube(count: int, seed: int) -> tuple[torch.Tensor, torch.Tensor, float]:
@@ -92,7 +114,9 @@ def cube(count: int, seed: int) -> tuple[torch.Tensor, torch.Tensor, float]:
     return position, torch.full((len(position),), 1.0 / side**3), 2.0 / side
 
 
-def run(name: str, position, volume, dx: float, device: str, frame_dt: float, *, backward: bool) -> tuple[float, int]:
+def run(
+    name: str, position, volume, dx: float, device: str, frame_dt: float, *, backward: bool, threads: int = 1
+) -> tuple[float, int]:
     """Seconds and substeps of a rollout of two frames."""
     material = MATERIALS[name]
     world = World(
@@ -101,44 +125,48 @@ def run(name: str, position, volume, dx: float, device: str, frame_dt: float, *,
     )  # fmt: skip
     parameters = {k: torch.tensor(v, requires_grad=True) for k, v in world.start.items()}
     velocity = torch.stack([0.1 * position[:, 1], -0.1 * position[:, 0], 0 * position[:, 0]], -1)
-    options = dict(velocity=velocity, frames=2, frame_dt=frame_dt, device=device, log=Log(None))
-    start = time.perf_counter()
-    if backward:
+    options = dict(velocity=velocity, frames=2, frame_dt=frame_dt, device=device, threads=threads, log=Log(None))
+    clock = time.process_time if threads == 1 else time.perf_counter
+    start = clock()
+    with torch.set_grad_enabled(backward):
         motion = rollout(world, parameters, position, volume, **options)
+    if backward:
         motion.position.square().sum().backward()
-    else:
-        with torch.no_grad():
-            motion = rollout(world, parameters, position, volume, **options)
-    synchronise(device)
-    return time.perf_counter() - start, motion.substeps
+    return clock() - start, motion.substeps
 
 
-def per_substep(name: str, position, volume, dx: float, device: str, substeps: int, **options) -> float:
-    """Seconds per substep, the long run having four times the `substeps` of the short one."""
-    substep = 0.5 * dx / 20.0  # [s]; the run says how many it took
-    short = long = math.inf
-    run(name, position, volume, dx, device, substep, **options)
-    for _ in range(3 if substeps > 8 else 1):
-        seconds, few = run(name, position, volume, dx, device, substeps * substep, **options)
-        short = min(short, seconds)
-        seconds, many = run(name, position, volume, dx, device, 4 * substeps * substep, **options)
-        long = min(long, seconds)
-    return (long - short) / (many - few)
+def per_substep(name: str, position, volume, dx: float, *, backward: bool, threads: int) -> tuple[float, float]:
+    """(seconds per substep, spread)."""
+    n, substep = len(position), 0.5 * dx / 20.0  # [s]; the run says how many it took
+    # of a shortest run of a twentieth of a second at least
+    shortest = max(4, min(256, 1_000_000 // n)) * (1 if backward else 2)
+
+    def work(length: int) -> tuple[float, int]:
+        return run(
+            name, position, volume, dx, "cpu", length * shortest * substep, backward=backward, threads=threads
+        )  # fmt: skip
+
+    work(1)
+    return slope(work, (1, 2, 3, 4), 3 if n < 500_000 else 2)
 
 
-def simulation(name: str, count: int, device: str, seed: int, *, backward: bool = True) -> list[dict]:
+def simulation(name: str, count: int, threads: int, seed: int, *, backward: bool = True) -> list[dict]:
     position, volume, dx = cube(count, seed)
     n = len(position)
-    # few of them where they take seconds, many on a GPU
-    substeps = (256 if count < 1_000_000 else 64) if device.startswith("cuda") else 32 if count < 1_000_000 else 8
-    watched, forward = watch(lambda: per_substep(name, position, volume, dx, device, substeps, backward=False))
-    rows = [row(f"{name}, forward", n, 1e9 * forward / n, PER_SUBSTEP)]
-    if count == 1_000_000 and not device.startswith("cuda"):
-        rows.append(row(f"{name}, resident forward", n, watched / n, "bytes per particle"))
+    work = lambda backward: per_substep(name, position, volume, dx, backward=backward, threads=threads)
+    watched, (forward, spread) = watch(lambda: work(False))
+    cost = lambda kind, seconds, spread: row(
+        name, kind, n, 1e9 * seconds / n, PER_SUBSTEP, spread=1e9 * spread / n, threads=threads
+    )
+    rows = [cost("forward", forward, spread)]
+    if count == 1_000_000 and threads == 1:
+        rows.append(row(name, "resident forward", n, watched / n, "bytes per particle", threads=threads))
     if backward:
-        both = per_substep(name, position, volume, dx, device, substeps, backward=True)
-        rows.append(row(f"{name}, forward + adjoint", n, 1e9 * both / n, PER_SUBSTEP))
-        rows.append(row(f"{name}, adjoint / forward", n, both / forward - 1, "ratio"))
+        both, wide = work(True)
+        rows.append(cost("forward + adjoint", both, wide))
+        ratio = both / forward - 1
+        error = (ratio + 1) * (spread / forward + wide / both)
+        rows.append(row(name, "adjoint / forward", n, ratio, "ratio", spread=error, threads=threads))
     return rows
 
 
@@ -168,17 +196,17 @@ def resident() -> int:
         return 0
 
 
-def empty_cells(device: str, seed: int) -> list[dict]:
+def empty_cells(seed: int) -> list[dict]:
     """A body and two lone particles, in a box as small as possible and in one of eight times the nodes."""
     position, volume, dx = cube(20_000, seed)
     rows = []
     for factor, what in ((1.0, "near"), (2.0, "far, 8 x the nodes")):
         lone = torch.tensor([[-0.3, -0.3, -0.3], [1.3, 1.3, 1.3]]) + torch.tensor([[0.0], [1.6 * (factor - 1)]])
-        both = torch.cat([position, lone])
-        seconds = per_substep(
-            "fixed corotated", both, torch.cat([volume, volume[:2]]), dx, device, 32, backward=False
-        )  # fmt: skip
-        rows.append(row(f"empty cells, lone particles {what}", len(both), 1e9 * seconds / len(both), PER_SUBSTEP))
+        both, volumes = torch.cat([position, lone]), torch.cat([volume, volume[:2]])
+        seconds, spread = per_substep("fixed corotated", both, volumes, dx, backward=False, threads=1)
+        n = len(both)
+        cost, wide = 1e9 * seconds / n, 1e9 * spread / n
+        rows.append(row("empty cells", f"lone particles {what}", n, cost, PER_SUBSTEP, spread=wide, threads=1))
     return rows
 
 
@@ -189,7 +217,7 @@ def compilation(name: str, device: str) -> dict:
         found = subprocess.run(
             command, env=os.environ | {"WARP_CACHE_PATH": folder}, check=True, capture_output=True, text=True
         ).stdout
-    return row(f"{name}, compilation", 8, json.loads(found.strip().splitlines()[-1]), "s")
+    return row(name, "compilation", 8, json.loads(found.strip().splitlines()[-1]), "s")
 
 
 def first_rollout(name: str, device: str) -> float:
@@ -198,14 +226,15 @@ def first_rollout(name: str, device: str) -> float:
     return first - again
 
 
-def taichi(python: str, count: int) -> list[dict]:
+def taichi(python: str, count: int, threads: int) -> list[dict]:
     """Taichi's own mpm3d, as installed, with more particles and nodes; nothing if that Python has no Taichi."""
     script = """
 import importlib.util, json, pathlib, sys, tempfile, time
 import taichi as ti
 source = pathlib.Path(importlib.util.find_spec("taichi").origin).parent / "examples" / "simulation" / "mpm3d.py"
 text = source.read_text()
-for old, new in (("arch=ti.gpu", "arch=ti.cpu"), ("dim, n_grid, steps, dt = 3, 32, 25, 4e-4",
+for old, new in (("arch=ti.gpu", f"arch=ti.cpu, cpu_max_num_threads={sys.argv[2]}"),
+                 ("dim, n_grid, steps, dt = 3, 32, 25, 4e-4",
                  "dim, n_grid, steps, dt = 3, 64, 25, 2e-4"), ("n_particles = n_grid**dim // 2 ** (dim - 1)",
                  "n_particles = COUNT")):
     assert old in text, old
@@ -218,21 +247,27 @@ with tempfile.TemporaryDirectory() as folder:
     spec.loader.exec_module(example)
     example.init()
     times = []
-    for _ in range(4):
+    clock = time.process_time if sys.argv[2] == "1" else time.perf_counter
+    for k in range(21):
         ti.sync()
-        start = time.perf_counter()
-        for _ in range(25):
+        start = clock()
+        for _ in range(10 * (1 + k % 4)):
             example.substep()
         ti.sync()
-        times.append((time.perf_counter() - start) / 25)
-    print(json.dumps([sorted(times[1:])[1], ".".join(map(str, ti.__version__))]))
+        times.append([clock() - start, 10 * (1 + k % 4)])
+    print(json.dumps([times[1:], ".".join(map(str, ti.__version__))]))
 """
-    done = subprocess.run([python, "-c", script, str(count)], capture_output=True, text=True)
+    done = subprocess.run([python, "-c", script, str(count), str(threads)], capture_output=True, text=True)
     if done.returncode:
         print(f"no row of Taichi: {(done.stderr.strip().splitlines() or ['?'])[-1]}")
         return []
-    seconds, version = json.loads(done.stdout.strip().splitlines()[-1])
-    return [row(f"Taichi {version} mpm3d, forward", count, 1e9 * seconds / count, PER_SUBSTEP)]
+    times, version = json.loads(done.stdout.strip().splitlines()[-1])
+    measured = iter(times)
+    seconds, spread = slope(lambda length: next(measured), (20, 30, 40, 10), 5)
+    name = f"Taichi {version} mpm3d"
+    return [
+        row(name, "forward", count, 1e9 * seconds / count, PER_SUBSTEP, spread=1e9 * spread / count, threads=threads)
+    ]
 
 
 def rendering(count: int, side: int, device: str, seed: int) -> list[dict]:
@@ -246,88 +281,116 @@ def rendering(count: int, side: int, device: str, seed: int) -> list[dict]:
     pose = look_at(torch.tensor([0.0, -3.0, 0.5]), torch.zeros(3))
     camera = Camera(width=side, height=side, fx=side, fy=side, cx=side / 2, cy=side / 2, world_to_camera=pose)
     rows = []
-    for backward in (False, True):
-        times = []
-        for _ in range(4):
-            synchronise(device)
-            start = time.perf_counter()
-            image = rasterize(*inputs, camera, background=torch.ones(3, device=device)).color
-            if backward:
-                image.square().sum().backward()
-            synchronise(device)
-            times.append(time.perf_counter() - start)
-        what = f"render {side} x {side}, {'forward + adjoint' if backward else 'forward'}"
-        rows.append(row(what, count, 1e3 * statistics.median(times[1:]), "ms per picture"))
+    for kind, backward in (("forward", False), ("forward + adjoint", True)):
+
+        def pictures(number: int, backward: bool = backward) -> tuple[float, int]:
+            start = time.process_time()
+            for _ in range(number):
+                with torch.set_grad_enabled(backward):
+                    image = rasterize(*inputs, camera, background=torch.ones(3, device=device)).color
+                if backward:
+                    image.square().sum().backward()
+            return time.process_time() - start, number
+
+        pictures(1)
+        seconds, spread = slope(pictures, (1, 3, 5), 4)
+        rows.append(
+            row(f"render {side} x {side}", kind, count, 1e3 * seconds, "ms per picture", spread=1e3 * spread)
+        )  # fmt: skip
     return rows
 
 
-def synchronise(device: str) -> None:
-    if device.startswith("cuda"):
-        wp.synchronize()
-        torch.cuda.synchronize()
-
-
-def write(rows: list[dict], device: str, seed: int) -> None:
+def write(rows: list[dict], device: str, seed: int, load: tuple[float, float]) -> None:
+    """Table, plot and page. What scatters by more than half of itself says nothing, and is left out with a word."""
     from matplotlib.figure import Figure
 
+    told = [r for r in rows if r["spread"] <= UNSURE * abs(r["value"])]
+    unsure, rows = len(rows) - len(told), told
+
     RESULTS.mkdir(parents=True, exist_ok=True)
-    title = f"{machine(device)}, seed {seed}"
-    kind = device.split(":")[0]
-    with (RESULTS / f"speed_{kind}.csv").open("w", newline="") as file:
+    title = f"{machine(device)}, seed {seed}, load {load[0]:.1f} at the start and {load[1]:.1f} at the end"
+    with (RESULTS / "speed_cpu.csv").open("w", newline="") as file:
         file.write(f"# {title}\n")
         table = csv.DictWriter(file, rows[0])
         table.writeheader()
         table.writerows(rows)
-    (RESULTS / f"speed_{kind}.md").write_text(page(rows, title, kind))
-    figure = Figure(figsize=(9, 4.5), layout="constrained")
-    axis = figure.add_subplot()
-    timed = [r for r in rows if r["unit"] == PER_SUBSTEP and not r["what"].startswith("empty")]
-    for i, name in enumerate(dict.fromkeys(r["what"].rsplit(", ", 1)[0] for r in timed)):
-        for style, what in (("-", "forward"), ("--", "forward + adjoint")):
-            mine = [r for r in timed if r["what"] == f"{name}, {what}"]
-            if mine:
-                sizes, values = [r["size"] for r in mine], [r["value"] for r in mine]
-                axis.plot(sizes, values, style, marker="o", color=f"C{i}", label=f"{name}, {what}")
-    axis.set(xscale="log", yscale="log", xlabel="particles", ylabel=PER_SUBSTEP, title=title)
-    axis.title.set_size(8)
-    if axis.lines:
-        axis.legend(fontsize=7)
-    axis.grid(alpha=0.3, which="both")
-    figure.savefig(RESULTS / f"speed_{kind}.png", dpi=110)
+    (RESULTS / "speed_cpu.md").write_text(page(rows, title, unsure))
+    cores = sorted({r["threads"] for r in rows if r["threads"]})
+    figure = Figure(figsize=(2 + 5 * len(cores), 4.5), layout="constrained")
+    for axis, threads in zip(figure.subplots(1, len(cores), sharey=True, squeeze=False)[0], cores):
+        timed = [r for r in rows if r["unit"] == PER_SUBSTEP and r["threads"] == threads and r["what"] != "empty cells"]
+        for i, name in enumerate(dict.fromkeys(r["what"] for r in timed)):
+            for style, kind in (("-", "forward"), ("--", "forward + adjoint")):
+                mine = [r for r in timed if (r["what"], r["kind"]) == (name, kind)]
+                if mine:
+                    x, y, spread = ([r[key] for r in mine] for key in ("size", "value", "spread"))
+                    axis.errorbar(x, y, spread, fmt=f"o{style}", color=f"C{i}", capsize=3, label=f"{name}, {kind}")
+        axis.set(xscale="log", yscale="log", xlabel="particles", title=f"{threads} thread{'s' * (threads - 1)}")
+        axis.grid(alpha=0.3, which="both")
+    figure.axes[0].set_ylabel(PER_SUBSTEP)
+    figure.axes[0].legend(fontsize=7)
+    figure.savefig(RESULTS / "speed_cpu.png", dpi=110)
 
 
-def page(rows: list[dict], title: str, kind: str) -> str:
+def page(rows: list[dict], title: str, unsure: int) -> str:
     lines = ["# Speed and memory", "", f"Made by `make bench-speed`. Machine: {title}.", ""]
-    lines += [*__doc__.split("\n\n", 2)[2].strip().splitlines(), "", f"![cost against particles](speed_{kind}.png)", ""]
-    sentences = findings(rows)
-    if sentences:
-        lines += ["## What it shows", "", *(f"- {sentence}" for sentence in sentences), ""]
-    lines += ["## Rows", "", "| what | size | value | unit |", "|---|---|---|---|"]
-    lines += [f"| {r['what']} | {r['size']} | {r['value']:.4g} | {r['unit']} |" for r in rows]
+    lines += [*__doc__.split("\n\n", 2)[2].strip().splitlines(), "", "![cost against particles](speed_cpu.png)", ""]
+    lines += ["## What it shows", "", *(f"- {sentence}" for sentence in findings(rows)), ""]
+    if not any(r["threads"] == 2 for r in rows):
+        lines += ["Two threads were not measured: other work kept the cores.", ""]
+    if unsure:
+        lines += [f"{unsure} rows are left out: they scatter by more than {UNSURE:.0%} of themselves at this load.", ""]
+    lines += ["## Rows", "", "| what | | size | threads | value | spread | unit |", "|---|---|---|---|---|---|---|"]
+    for r in rows:
+        spread = f"{r['spread']:.2g}" if r["spread"] else ""
+        lines.append(
+            f"| {r['what']} | {r['kind']} | {r['size']} | {r['threads']} | {r['value']:.4g} | {spread} | {r['unit']} |"
+        )
     return "\n".join(lines) + "\n"
 
 
 def findings(rows: list[dict]) -> list[str]:
     sentences = []
-    solid = [r for r in rows if r["what"] == "fixed corotated, forward"]
-    peer = next((r for r in rows if r["what"].startswith("Taichi")), None)
-    here = next((r for r in solid if peer and abs(r["size"] / peer["size"] - 1) < 0.1), None)
-    if peer and here:
-        name = peer["what"].split(",")[0]
-        sentences.append(
-            f"{name} takes {peer['value'] / here['value']:.1f} times as long per particle and substep as the fixed "
-            f"corotated solid ({peer['value']:.0f} and {here['value']:.0f} ns)."
-        )
-    if len(solid) > 1:
-        costs = ", ".join(f"{r['value']:.0f} ns at {r['size']:.0e}" for r in solid)
-        sentences.append(f"Cost per particle and substep against size: {costs} particles.")
-    empty = [r["value"] for r in rows if r["what"].startswith("empty")]
+    costs = {(r["what"], r["kind"], r["size"], r["threads"]): r for r in rows if r["unit"] == PER_SUBSTEP}
+    for (what, _, size, threads), peer in costs.items():
+        if what.startswith("Taichi"):
+            alike = [
+                r
+                for key, r in costs.items()
+                if key[:2] == ("fixed corotated", "forward") and key[3] == threads and abs(key[2] / size - 1) < 0.1
+            ]
+            if not alike:
+                continue
+            here = alike[0]
+            sentences.append(
+                f"{what} takes {peer['value'] / here['value']:.1f} times as long per particle and substep as the fixed "
+                f"corotated solid, threads: {threads} ({peer['value']:.0f} +- {peer['spread']:.0f} "
+                f"and {here['value']:.0f} +- {here['spread']:.0f} ns)."
+            )
+    for name in MATERIALS:
+        gains = [
+            f"{r['value'] / costs[what, kind, size, 2]['value']:.2f} at {size}"
+            for (what, kind, size, threads), r in costs.items()
+            if (what, kind, threads) == (name, "forward", 1) and (what, kind, size, 2) in costs
+        ]
+        if gains:
+            sentences.append(f"{name}: two threads gain {', '.join(gains)} particles.")
+        ratios = [
+            f"{r['value']:.1f} at {r['size']}"
+            for r in rows
+            if (r["what"], r["unit"], r["threads"]) == (name, "ratio", 1)
+        ]
+        if ratios:
+            sentences.append(
+                f"{name}: the adjoint takes {', '.join(ratios)} particles times the forward run, on one thread."
+            )
+    empty = [r["value"] for r in rows if r["what"] == "empty cells"]
     if len(empty) == 2:
         sentences.append(
             f"Eight times the nodes around the same particles cost {empty[1] / empty[0]:.2f} times as much."
         )
     for r in rows:
-        if r["what"].endswith("resident forward"):
+        if r["kind"] == "resident forward":
             sentences.append(
                 f"A forward run holds {r['value']:.0f} bytes per particle, its inputs and frames included."
             )

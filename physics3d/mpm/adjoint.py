@@ -7,6 +7,7 @@ are far more than particles; then the particles are scattered again.
 
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,6 +15,7 @@ import warp as wp
 
 from physics3d.mpm import grids, transfer
 from physics3d.mpm.arrays import Arrays
+from physics3d.mpm.graphs import Graphs
 from physics3d.mpm.launches import Arguments, launch_over, record
 from physics3d.mpm.state import State
 from physics3d.mpm.substep import Launches, Substeps
@@ -33,6 +35,7 @@ class Adjoint:
         arrays, real = self.arrays, self.arrays.real
         vec3 = vector(real)
         self.states: list[State] = [arrays.new_state(), arrays.new_state()]
+        self._flat: list[Any] = [wp.from_torch(state.flat) for state in self.states]  # the same bytes
         self.v_pushed: wp.array | None = arrays.zeros(arrays.n, vec3) if arrays.v_pushed is not None else None
         self.coefficients: wp.array = arrays.zeros((arrays.row_count, arrays.n), real)
         self.offset: wp.array = arrays.zeros(arrays.n, vec3)
@@ -51,6 +54,7 @@ class Adjoint:
         self.fours: wp.array | None = None  # node velocities as the fast gather adds to them
         self.momenta: wp.array | None = None  # [substep of a run, node] before the update
         self._launches: dict[tuple[int, int, int, int], Launches] = {}  # of worker w, from state j to i, adjoint set
+        self.graphs = Graphs(arrays.device)  # of runs backwards
         self.follow_grid()
 
     def clear(self) -> None:
@@ -81,7 +85,7 @@ class Adjoint:
             for (s, _), launch, adjoint, now in zip(steps, forward[w], backward[w], sides):
                 arrays.set_row(w, s)
                 if w == 0:
-                    self.states[1 - now].flat.zero_()
+                    self._flat[1 - now].zero_()
                 for name in ("clear_pushed", "clear_mass", "clear_volume"):
                     if name in adjoint:
                         adjoint[name].launch()
@@ -123,7 +127,11 @@ class Adjoint:
                     if name in adjoint:
                         adjoint[name].launch()
 
-        on_all(arrays.workers, worker)
+        if arrays.recorded and momenta is None:
+            key = (tuple(path), side, arrays.node_count)
+            self.graphs.run(key, lambda: worker(0, lambda: None))
+        else:
+            on_all(arrays.workers, worker)
         return (side + len(steps)) % 2
 
     def reverse_start(self, clock: np.ndarray, i: int, j: int, side: int) -> int:
@@ -245,6 +253,7 @@ class Adjoint:
         if self.capacity == arrays.capacity:
             return
         self.capacity, self._launches = arrays.capacity, {}
+        self.graphs.forget()
         vec3, vec4 = vector(arrays.real), vector4(arrays.real)
         self.grid = arrays.zeros(self.capacity, vec4)
         self.node_velocity = arrays.zeros((arrays.workers, self.capacity), vec3)

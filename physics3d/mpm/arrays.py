@@ -12,6 +12,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from physics3d.mpm.grids import count_up
 from physics3d.mpm.hold import least_distance
 from physics3d.mpm.hooks import FIRST_SIGNAL, Hooks
 from physics3d.mpm.state import State, make_state
@@ -42,12 +43,14 @@ class Arrays:
         longest_run: int,  # substeps
         threads: int,
         fast: bool | None = None,  # one pass over the particles per substep; None: on a CPU
+        recorded: bool | None = None,  # runs of substeps as graphs, with one worker; None: on CUDA
     ):
         self.dtype: torch.dtype = mass.dtype
         self.device: torch.device = mass.device
         self.real: type = wp.float32 if self.dtype == torch.float32 else wp.float64
         on_cpu = self.device.type == "cpu"
         self.fast: bool = on_cpu if fast is None else fast
+        self.recorded: bool = not on_cpu if recorded is None else recorded
         self.n: int = len(mass)
         self.dx: float = dx
         self.memory_rows: int = memory_rows
@@ -89,12 +92,15 @@ class Arrays:
         self.row: list[wp.array] = [self.zeros(1, wp.int32) for _ in self.ranges]  # of the clock
         self.stamp: list[wp.array] = [self.zeros(1, wp.int32) for _ in self.ranges]  # of what is touched
         self.lost: list[wp.array] = [self.zeros(1, wp.int32) for _ in self.ranges]  # particles outside the window
-        self._row_numpy: list[np.ndarray] = [row.numpy() for row in self.row] if on_cpu else []
-        self._stamp_numpy: list[np.ndarray] = [stamp.numpy() for stamp in self.stamp] if on_cpu else []
-        self._last_stamp: list[int] = [0 for _ in self.ranges]
+        # written by the host, where that needs no launch and nothing is recorded
+        by_host = on_cpu and not self.recorded
+        self._row_numpy: list[np.ndarray] = [row.numpy() for row in self.row] if by_host else []
+        self._stamp_numpy: list[np.ndarray] = [stamp.numpy() for stamp in self.stamp] if by_host else []
         # the grid
         self._touch_count: int = len(hooks.touch)
         self.window: wp.array = self.zeros(6, wp.int32)  # lowest node and number of nodes along each axis
+        self.lowest: tuple[int, ...] = (0, 0, 0)  # the same for the host
+        self.size: tuple[int, ...] = (0, 0, 0)
         self.node_count: int = 0  # in the window
         self.capacity: int = 0  # nodes that the grid has room for; another one: the arrays below are others
         # what is added up there, in double precision on a CPU: the sums of many would drift in single precision
@@ -125,6 +131,7 @@ class Arrays:
     def set_window(self, lowest: Sequence[int], size: Sequence[int]) -> None:
         """Lay the grid over nodes lowest .. lowest + size - 1."""
         self.window.assign(np.array([*lowest, *size], np.int32))
+        self.lowest, self.size = tuple(lowest), tuple(size)
         self.node_count = int(np.prod(size))
         if self.node_count > self.capacity:
             self.capacity = int(1.5 * self.node_count) + 1  # one more: see `columns`
@@ -153,11 +160,10 @@ class Arrays:
 
     def new_stamp(self, w: int) -> None:
         """The same on every thread, for all take the same steps."""
-        self._last_stamp[w] += 1
         if self._stamp_numpy:
-            self._stamp_numpy[w][0] = self._last_stamp[w]
+            self._stamp_numpy[w][0] += 1
         else:
-            self.stamp[w].fill_(self._last_stamp[w])
+            wp.launch(count_up, 1, inputs=[self.stamp[w]], device=str(self.device))
 
     def shared(self, w: int) -> dict[str, object]:
         """What kernels of worker w may ask for, whatever the states they work on."""

@@ -27,6 +27,7 @@ from physics3d.mpm.implicit.step import ImplicitSubsteps
 from physics3d.mpm.limits import WORTH, explicit_limit, explicit_need, implicit_need, substeps_of_frame
 from physics3d.mpm.problem import Problem
 from physics3d.mpm.state import State
+from physics3d.mpm.survey import Survey
 from physics3d.mpm.window import window
 
 TRIES = 6  # of one frame, each with twice the substeps
@@ -258,14 +259,12 @@ class Frames:
     def _explicit_runs(self, frame: int, count: int, reach: float) -> list[Run]:
         dt = self.problem.frame_dt / count
         runs: list[Run] = []
-        done = 0
+        done, now = 0, self.now
+        seen = self.body.look(now)
         while done < count:
-            now = self.now
             # the limit follows the strain: look again before a particle has changed by a tenth, or snow that is packed
             # within a run bursts unseen
-            rate = float(now.L.flatten(1).norm(dim=1).max())
-            steps = min(RUN, count - done, max(1, int(0.1 / max(1e-30, rate * dt))))
-            seen = self.body.look(now)
+            steps = min(RUN, count - done, max(1, int(0.1 / max(1e-30, seen.rate * dt))))
             lowest, size = window(self.problem.world, seen, steps=steps, dt=dt, reach=reach, frame=frame)
             self.arrays.set_window(lowest, size)
             t = (frame - 1) * self.problem.frame_dt + done * dt
@@ -276,7 +275,7 @@ class Frames:
             runs.append(Run(lowest, size, clock))
             lost = self.substeps.run(clock, [self.current] * (steps + 1))
             self.work.lost += lost
-            self._inspect(frame, dt, lost)
+            seen = self._inspect(frame, dt, lost)
             done += steps
         return runs
 
@@ -287,7 +286,7 @@ class Frames:
             needed = True
         self.checkpoints.offer(sum(len(runs) for runs in self.runs) + done, now.flat, needed=needed)
 
-    def _inspect(self, frame: int, dt: float, lost: int) -> None:
+    def _inspect(self, frame: int, dt: float, lost: int) -> Survey:
         """After a run: is every number finite, every particle in the region, and every substep short enough?"""
         world, now = self.problem.world, self.now
         seen = self.body.look(now)
@@ -314,6 +313,7 @@ class Frames:
                 f"frame {frame}: {seen.outside} of {len(now.u)} particles left the simulated region "
                 f"{self.problem.corners()}; enlarge world.lower and world.upper, or add a BoundingBox or a HalfSpace"
             )
+        return seen
 
     def _clock(self, t: float, dt: float, steps: int, *, kick: float) -> np.ndarray:
         """Table for the kernels, from time t [s] on; `kick` of the first substep, those after it have dt, from where

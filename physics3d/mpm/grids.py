@@ -7,6 +7,15 @@ import warp as wp
 from physics3d.warp_types import vector, vector4
 
 
+@wp.kernel(module="unique", enable_backward=False)
+def count_up(
+    # in, out
+    number: wp.array(dtype=int),  # [1]
+):
+    """One more, where the host may not say which: in a graph, which is recorded once."""
+    number[0] = number[0] + 1
+
+
 @cache
 def clear(dtype) -> wp.Kernel:
     """Kernel: set a range of an array to zero."""

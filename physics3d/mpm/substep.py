@@ -21,7 +21,7 @@ per substep and nothing is updated in place, so the adjoints of the kernels can 
 On a CPU the particles' part is one pass (`fused`) together with the scatter of the next substep; the separate kernels
 are its twins, what CUDA runs, and what the adjoint is of. The particles are divided over threads there; each scatters
 into a grid of its own, and the grids are summed in a fixed order: reruns are equal bit by bit. On CUDA there is one
-worker and the scatter is atomic.
+worker, the scatter is atomic, and a run of substeps is one graph (`graphs`).
 """
 
 from collections.abc import Sequence
@@ -34,6 +34,7 @@ from physics3d.mpm import grids, transfer
 from physics3d.mpm.advance import advance
 from physics3d.mpm.arrays import Arrays
 from physics3d.mpm.fused import particle_pass
+from physics3d.mpm.graphs import Graphs
 from physics3d.mpm.hold import face, hold, lead
 from physics3d.mpm.hooks import Hooks
 from physics3d.mpm.launches import Arguments, launch_over, record
@@ -71,6 +72,7 @@ class Substeps:
             self.kernels["lead"] = lead(real)
             self.kernels["steer"] = steer(real, hooks.grip, hooks.steer)
         self._launches: dict[tuple[int, int, int], Launches] = {}  # of worker w, from state i to state j
+        self.graphs = Graphs(arrays.device)  # of runs
         self._capacity: int = arrays.capacity  # of the grid that they are for
 
     def run(self, clock: np.ndarray, path: Sequence[int], momenta: np.ndarray | None = None) -> int:
@@ -83,8 +85,8 @@ class Substeps:
         arrays.set_clock(clock)
         for lost in arrays.lost:
             lost.zero_()
-        work = list(pairwise(path))
-        launches = [[self.launches(w, i, j) for i, j in work] for w in range(arrays.workers)]
+        steps = list(pairwise(path))
+        launches = [[self.launches(w, i, j) for i, j in steps] for w in range(arrays.workers)]
         nodes = shares(arrays.node_count, arrays.workers)
 
         def plain(w: int, wait: Wait) -> None:
@@ -101,7 +103,7 @@ class Substeps:
                         launch[name].launch()
 
         def fast(w: int, wait: Wait) -> None:
-            last = len(work) - 1
+            last = len(steps) - 1
             arrays.set_row(w, 0)
             self.hold(launches[w][0])
             self.scatter(launches[w][0])
@@ -115,11 +117,15 @@ class Substeps:
                 wait()
                 if s < last:
                     launch_over(launch["clear"], 0, arrays.node_count)
-                launch["pass"].set_param_by_name("keep", int(s == last or work[s][0] != work[s][1]))
+                launch["pass"].set_param_by_name("keep", int(s == last or steps[s][0] != steps[s][1]))
                 launch["pass"].set_param_by_name("onward", int(s < last))
                 launch["pass"].launch()
 
-        on_all(arrays.workers, fast if arrays.fast else plain)
+        work = fast if arrays.fast else plain
+        if arrays.recorded and momenta is None:
+            self.graphs.run((tuple(path), arrays.node_count), lambda: work(0, lambda: None))
+        else:
+            on_all(arrays.workers, work)
         return sum(int(lost.numpy()[0]) for lost in arrays.lost)
 
     def look(self, clock: np.ndarray, i: int, j: int) -> None:
@@ -221,6 +227,7 @@ class Substeps:
         """Of worker w, for the substep from state i to state j."""
         if self._capacity != self.arrays.capacity:
             self._capacity, self._launches = self.arrays.capacity, {}
+            self.graphs.forget()
         key = (w, i, j)
         if key not in self._launches:
             self._launches[key] = self._record(w, i, j)

@@ -20,6 +20,7 @@ class Survey:
 
     stiffness: float  # max of M + 2 max |principal Kirchhoff stress| [Pa]
     speed: float  # [m/s]
+    rate: float  # of the velocity gradient, its norm [1/s]
     lowest: tuple[int, ...]  # cell
     highest: tuple[int, ...]
     infinite: int  # particles whose place, velocity or stress is infinite or NaN
@@ -43,9 +44,10 @@ def _survey(real) -> wp.Kernel:
         offset: wp.array(dtype=vec3),  # [p] of the rest position in its cell [cells]
         u: wp.array(dtype=vec3),  # [p] displacement [m]
         v: wp.array(dtype=vec3),  # [p] [m/s]
+        L: wp.array(dtype=mat33),  # [p] [1/s]
         tau: wp.array(dtype=mat33),  # [p] Kirchhoff stress [Pa]
         # out
-        greatest: wp.array(dtype=real),  # [2] stiffness, speed squared
+        greatest: wp.array(dtype=real),  # [3] stiffness, squares of speed and rate
         counts: wp.array(dtype=int),  # [8] lowest cell, highest cell, infinite, outside
     ):
         p = wp.tid()
@@ -60,6 +62,9 @@ def _survey(real) -> wp.Kernel:
             return
         if speed > greatest[1]:
             wp.atomic_max(greatest, 1, speed)
+        rate = wp.ddot(L[p], L[p])
+        if rate > greatest[2]:
+            wp.atomic_max(greatest, 2, rate)
         # the eigenvalues are mean + 2 size cos(...): looked at only where they may matter
         if modulus[p] + real(2.0) * (wp.abs(mean) + real(2.0) * size) > greatest[0]:
             most = wp.abs(mean)
@@ -93,13 +98,14 @@ def survey(
     real = wp.float32 if state.u.dtype == torch.float32 else wp.float64
     device = str(state.u.device)
     modulus = modulus.to(state.u).expand(len(state.u)).contiguous()
-    greatest = wp.zeros(2, dtype=real, device=device)
+    greatest = wp.zeros(3, dtype=real, device=device)
     counts = wp.array(np.array([2**30] * 3 + [-(2**30)] * 3 + [0, 0], np.int32), dtype=wp.int32, device=device)
     vec3 = vector(real)
     inputs = [dx, vec3(*lower.tolist()), vec3(*upper.tolist()), wp.from_torch(modulus)]
     inputs += [constant[name] for name in ("rest", "cell", "offset")]
-    inputs += [state.warp[name] for name in ("u", "v", "tau")]
+    inputs += [state.warp[name] for name in ("u", "v", "L", "tau")]
     wp.launch(_survey(real), len(state.u), inputs=inputs, outputs=[greatest, counts], device=device)
-    stiffness, squared = greatest.numpy().tolist()
+    stiffness, *squared = greatest.numpy().tolist()
     found = counts.numpy().tolist()
-    return Survey(stiffness, squared**0.5, tuple(found[:3]), tuple(found[3:6]), found[6], found[7])
+    speed, rate = (x**0.5 for x in squared)
+    return Survey(stiffness, speed, rate, tuple(found[:3]), tuple(found[3:6]), found[6], found[7])

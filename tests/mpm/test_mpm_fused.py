@@ -7,6 +7,7 @@ from mpm_bodies import block, every_material, tensors
 
 from physics3d.boundaries.base import Setting
 from physics3d.boundaries.enforced_rotation import EnforcedRotation
+from physics3d.boundaries.half_space import HalfSpace
 from physics3d.boundaries.impulse import Impulse
 from physics3d.materials.viscoelastic import Viscoelastic
 from physics3d.mpm.arrays import Arrays
@@ -17,8 +18,11 @@ from physics3d.warp_start import start_warp
 DX, STEPS = 0.1, 5
 
 
-def substeps(material, *, fast: bool, moved: bool = False, threads: int = 1) -> tuple[Substeps, np.ndarray]:
-    """A block of 3 x 3 x 3 cells in motion, pushed and turned if `moved`, and the clock of some substeps."""
+def substeps(
+    material, *, fast: bool, moved: bool = False, threads: int = 1, recorded: bool = False, floor: bool = True
+) -> tuple[Substeps, np.ndarray]:
+    """A block of 3 x 3 x 3 cells in motion, pushed, turned and, with a `floor`, touching that, if `moved`; and the
+    clock of some substeps."""
     import warp as wp
 
     start_warp()
@@ -32,7 +36,8 @@ def substeps(material, *, fast: bool, moved: bool = False, threads: int = 1) -> 
         point=(0.15, 0.15, 0.05), axis=(0.0, 0.1, 1.0), radius=0.12, half_height=0.06, angular_velocity=5.0,
         start=0.0, duration=1.0,
     )  # fmt: skip
-    boundaries = [push, turn] if moved else []
+    ground = HalfSpace(point=(0.0, 0.0, 0.01), normal=(0.0, 0.0, 1.0), kind="separate")
+    boundaries = [push, turn, *([ground] if floor else [])] if moved else []
     coefficients = material.coefficients(tensors(material.example)).expand(-1, n).contiguous()
     dt = 0.1 * DX * (1000.0 / float(material.wave_modulus(coefficients).max())) ** 0.5
     signals = [boundary.signals(0.0, dt) for boundary in boundaries]
@@ -58,6 +63,7 @@ def substeps(material, *, fast: bool, moved: bool = False, threads: int = 1) -> 
         longest_run=STEPS,
         threads=threads,
         fast=fast,
+        recorded=recorded,
     )
     arrays.set_window((-3, -3, -3), (9, 9, 9))
     first = arrays.state(0)

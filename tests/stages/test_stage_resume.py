@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from interrupted import Interrupted
-from small_scene import ELASTIC, bar, capture, learner
+from small_scene import DAMPED, ELASTIC, bar, capture, learner
 from test_stage_reconstruct import QUICK, make_capture
 
 import physics3d.checkpoint
@@ -71,11 +71,21 @@ def test_what_a_fit_did_after_its_last_checkpoint_is_done_again_and_not_told_twi
     assert max(step for _, step, _ in points(tmp_path / "straight") if step is not None) < 30
 
 
-def test_learning_ends_as_if_it_had_not_been_stopped(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("solver", "start", "stops"),
+    [
+        # in the search, the descent, and while the polish looks around
+        ("grid", ELASTIC, (1, 3, 8)),
+        # without a grid, as a body that is held learns by default; and in the second valley of a relaxation time
+        ("modes", DAMPED, (1, 4, 9)),
+    ],
+)
+def test_learning_ends_as_if_it_had_not_been_stopped(tmp_path, monkeypatch, solver, start, stops):
     monkeypatch.setattr(physics3d.checkpoint, "LONGEST", 0.0)
-    clip = capture(ELASTIC, frames=3)
-    options = dict(search=2, steps=2, polish=1, frames=3, frames_per_step=2, stay=0.01)
-    stage = learner(ELASTIC | {"youngs_modulus": 1.5e4}, ("youngs_modulus",), **options)
-    # in the search, the descent, and while the polish looks around
-    assert_unchanged_by_stops(lambda log: stage(clip, *bar(), log=log), tmp_path, (1, 3, 8))
+    clip = capture(start, frames=3, solver=solver)
+    options = dict(search=2, steps=2, polish=1, frames=3, frames_per_step=2, stay=0.01, solver=solver)
+    learn = tuple(name for name in start if name in ("youngs_modulus", "shear_relaxation_time"))
+    stage = learner(start | {"youngs_modulus": 1.5e4}, learn, **options)
+    assert_unchanged_by_stops(lambda log: stage(clip, *bar(), log=log), tmp_path, stops)
     assert resumptions(tmp_path) == 3
+    assert f"solver: {solver}" in (tmp_path / "straight" / "log.txt").read_text()

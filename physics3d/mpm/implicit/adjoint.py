@@ -69,7 +69,9 @@ def _solve(system: System, tangent: Tangent, constraints: Constraints, wanted: T
     if tangent.symmetric and constraints.projectors:
         rhs = constraints.derivative(wanted, transposed=True)
         target = relative * math.sqrt(dot(rhs, system.inverse_mass * rhs))
-        y, _, solved = projected_gradients(system, tangent, constraints, rhs, target)
+        slow = system.launches.slow
+        slow.follow(system.kick, system.launches.arrays.lowest, system.launches.arrays.size)
+        y, _, solved = projected_gradients(system, tangent, constraints, rhs, target, slow)
         if solved:
             return wanted - tangent.stiff(y)
 

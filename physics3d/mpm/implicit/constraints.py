@@ -9,7 +9,36 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from physics3d.mpm.hold import HELD
 from physics3d.mpm.implicit.system import System, dot
+
+
+class Groups:
+    """The derivative of node velocities by node momenta where nodes near what is gripped follow others (`hold`), and
+    no other boundary acts: with r_i the share of the velocity of node k that node i has,
+
+        sum_j r_i r_j x_j/sum_j r_j^2 m_j        over the nodes j that follow the same k, and k itself
+
+    It is symmetric. The kernel of the update says the same, node by node, at twenty times the cost."""
+
+    def __init__(self, system: System):
+        arrays, mass = system.launches.arrays, system.base[:, 3]
+        leader = wp.to_torch(arrays.leader)[: system.count].long()
+        depth = wp.to_torch(arrays.depth)[: system.count]
+        alone = torch.arange(system.count, device=leader.device)
+        self.top: Tensor = torch.where(leader >= 0, leader, alone)
+        follows = leader >= 0
+        ratio = torch.where(follows, depth / torch.where(follows, depth[self.top], 1.0), 1.0)
+        # nodes that are held have no part, nor have light ones that nobody follows
+        ratio = torch.where((leader == HELD) | (~follows & (system.present[:, 0] == 0)), 0.0, ratio)
+        inertia = torch.zeros_like(mass).index_add_(0, self.top, ratio.square() * mass)
+        self.ratio: Tensor = ratio[:, None]
+        self.mobility: Tensor = (system.decay / torch.where(inertia > 0, inertia, torch.inf))[
+            self.top, None
+        ] * self.ratio
+
+    def __call__(self, x: Tensor) -> Tensor:
+        return self.mobility * torch.zeros_like(x).index_add_(0, self.top, self.ratio * x)[self.top]
 
 
 class Constraints:
@@ -20,14 +49,20 @@ class Constraints:
         self.system = system
         self.P: Tensor | None = None  # [node, 3, 3]
         self.projectors: bool = True
+        self.groups: Groups | None = None  # P where nothing but these acts
         momentum = system.momentum
-        if system.coupled:
+        if system.coupled and not system.launches.arrays.mirrored:
+            x = torch.rand(momentum.shape, dtype=momentum.dtype, device=momentum.device) - 0.5
+            groups, there = Groups(system), self._pull(x)
+            if float((groups(x) - there).abs().max()) <= 100 * system.rounding * float(there.abs().max()):
+                self.groups = groups
+        if system.coupled and self.groups is None:
             x = torch.rand((2, *momentum.shape), dtype=momentum.dtype, device=momentum.device) - 0.5
             images = [self.derivative(y) for y in x]
             off = abs(dot(system.mass * x[0], images[1]) - dot(system.mass * x[1], images[0]))
             off += abs(dot(system.mass * x[0], self.derivative(images[1]) - images[1]))
             self.projectors = off <= 1e-4 * system.norm(x[0]) * system.norm(x[1])
-        elif bounded:
+        elif bounded and not system.coupled:
             self.P = momentum.new_empty((system.count, 3, 3))
             for k in range(3):
                 x = torch.zeros_like(momentum)
@@ -50,6 +85,8 @@ class Constraints:
 
     def _pull(self, x: Tensor) -> Tensor:
         """Adjoint of momentum -> bounded velocity, at what the grid holds."""
+        if self.groups is not None:
+            return self.groups(x)
         launches, count = self.system.launches, self.system.count
         grid = wp.to_torch(launches.probe_grid)[:count]
         grid.zero_()

@@ -11,6 +11,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from physics3d.mpm.implicit.slow import Course
 from physics3d.mpm.implicit.system import dot
 
 MOST = 2000  # products in one solve
@@ -18,10 +19,16 @@ Operator = Callable[[Tensor], Tensor]
 
 
 def conjugate_gradients(
-    product: Operator, rhs: Tensor, *, precondition: Operator, size: Callable[[Tensor], float], target: float
+    product: Operator,
+    rhs: Tensor,
+    *,
+    precondition: Operator,
+    size: Callable[[Tensor], float],
+    target: float,
+    course: Course | None = None,
 ) -> tuple[Tensor, int, bool]:
     """x with product(x) = rhs, in the range of `precondition`; count of products; is the `size` of the residual at most
-    `target`?"""
+    `target`? What it did is noted in `course`."""
     x, r = torch.zeros_like(rhs), rhs.clone()
     z = precondition(r)
     p, rz = z.clone(), dot(r, z)
@@ -35,9 +42,14 @@ def conjugate_gradients(
         a = rz / curvature
         x += a * p
         r -= a * Ap
+        if course is not None:
+            course.note(z, rz)
         z = precondition(r)
         rz, last = dot(r, z), rz
         p = z + (rz / last) * p
+        if course is not None:
+            course.a.append(a)
+            course.b.append(rz / last)
     return x, MOST, False
 
 

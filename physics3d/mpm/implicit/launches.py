@@ -11,6 +11,7 @@ from physics3d.mpm import transfer
 from physics3d.mpm.adjoint import Adjoint
 from physics3d.mpm.arrays import Arrays
 from physics3d.mpm.implicit.diagonal import diagonal
+from physics3d.mpm.implicit.slow import SlowModes
 from physics3d.mpm.implicit.stiffness import stiffness
 from physics3d.mpm.implicit.stress import stress, stress_adjoint
 from physics3d.mpm.launches import Arguments, launch_over, record
@@ -38,13 +39,18 @@ class StepLaunches:
         self.E: wp.array = zeros(n, mat33)  # adjoint of T
         self.own: dict[str, wp.array] = {name: zeros(n, mat33) for name in ("T", "tau", "L", "L_gathered")}  # adjoints
         self.own |= {name: zeros(n, vec3) for name in ("v", "v_gathered", "unused")}
-        self.C: wp.array = zeros((n, 81), real)  # dT_ab/dL_ce [Pa s], at 27 a + 9 b + 3 c + e
+        self.C: wp.array = zeros((n, 81), real)  # dT_ab/dL_ce [Pa s], at 27 c + 9 e + 3 a + b
         self.moduli: wp.array = zeros((n, 2), real)  # of the isotropic tensor with the same means [Pa s]
+        self.kick: float | None = None  # of the step whose symmetric C that is [s]; None: it is no step's
+        # what the first solve of the last step left of the residual, with a tangent of the step before and with its own
+        self.reached: dict[bool, float] = {False: 0.01, True: 0.01}
+        self.own_tangents: int = 0  # steps that are to come before the tangent of the last one is tried again
+        self.slow: SlowModes = SlowModes()
         self.folded: list[wp.array] = [zeros(1, wp.int32) for _ in self.arrays.ranges]  # particles
         # on the nodes
         self.capacity: int = 0
         self.w: wp.array = zeros(0, vec3)
-        self.Kw: wp.array = zeros((self.arrays.workers, 0), vec3)
+        self.Kw: wp.array = zeros((self.arrays.workers, 0), vector4(self.arrays.sums_real))
         self.blocks: wp.array = zeros((self.arrays.workers, 0), mat33)
         self.probe_velocity: wp.array = zeros(0, vec3)  # adjoint of velocities after the boundaries, and below it that
         self.probe_grid: wp.array = zeros(0, vector4(real))  # of momenta before them
@@ -64,7 +70,7 @@ class StepLaunches:
             return
         self.capacity = arrays.capacity
         self.w = arrays.zeros(self.capacity, vector(real))
-        self.Kw = arrays.zeros((arrays.workers, self.capacity), vector(real))
+        self.Kw = arrays.zeros((arrays.workers, self.capacity), vector4(arrays.sums_real))
         self.blocks = arrays.zeros((arrays.workers, self.capacity), matrix(real))
         self.probe_velocity = arrays.zeros(self.capacity, vector(real))
         self.probe_grid = arrays.zeros(self.capacity, vector4(real))
@@ -144,7 +150,10 @@ class StepLaunches:
             "advance_adjoint": self._back("advance", w, dict(L=own["L"], tau=own["tau"])),
             "steer_adjoint": self._back("steer", w, dict(**gathered, v=own["v"], L=own["L"])),
             "diagonal": (diagonal(real), dict(first=first, u=a["u"], moduli=self.moduli, blocks=self.blocks[w]), None),
-            "stiffness": (stiffness(real), dict(first=first, u=a["u"], C=self.C, w=self.w, Kw=self.Kw[w]), None),
+            "stiffness": (
+                stiffness(real, arrays.sums_real, arrays.fast),
+                dict(first=first, u=a["u"], C=self.C, w=self.w, Kw=self.Kw[w]), None,
+            ),
             "probe": self._back("update", w, probe),
             "probe_still": self._back("update", w, probe, gravity=vector(real)()),
         }  # fmt: skip

@@ -15,12 +15,22 @@ from physics3d.mpm.implicit.system import System
 class Tangent:
     """C and the diagonal blocks of M + K. Making another one changes C, which all share: the last one is true."""
 
-    def __init__(self, system: System, *, symmetric: bool):
-        """`symmetric`: take the symmetric part of C."""
+    def __init__(self, system: System, *, symmetric: bool, again: bool = False):
+        """`symmetric`: take the symmetric part of C; `again`: take that of the step before, if it was as long."""
         self.system = system
         launches = system.launches
-        n = launches.arrays.n
-        E, C = wp.to_torch(launches.E), wp.to_torch(launches.C)
+        C = wp.to_torch(launches.C)
+        again = again and symmetric and launches.kick == system.kick
+        self.fresh: bool = not again  # of the forces that the system made last
+        self.symmetric: bool = symmetric or again
+        if not again:
+            self._differentiate(C)
+        self.norm: Tensor = C.norm(dim=1)  # [p] Pa s
+        self.inverse_blocks: Tensor = self._inverse_blocks(C)  # [node, 3, 3] 1/kg
+
+    def _differentiate(self, C: Tensor) -> None:
+        launches = self.system.launches
+        n, E = launches.arrays.n, wp.to_torch(launches.E)
         steered = launches.arrays.steered
         adjoint_L = wp.to_torch(launches.own["L_gathered" if steered else "L"])
         for k in range(9):
@@ -30,13 +40,13 @@ class Tangent:
                 adjoint_L.zero_()
                 wp.to_torch(launches.own["v"]).zero_()
             launches.on_particles("stress_adjoint", "advance_adjoint", "steer_adjoint")
-            C.view(n, 9, 9)[:, k] = adjoint_L.view(n, 9)
+            C.view(n, 9, 9)[:, :, k] = adjoint_L.view(n, 9)
         square = C.view(n, 9, 9)
-        self.symmetric: bool = symmetric or bool((square - square.mT).abs().max() <= 1e-5 * square.abs().max())
-        if symmetric:
+        launches.kick = self.system.kick if self.symmetric else None
+        if self.symmetric:
             square.copy_(0.5 * (square + square.mT))
-        self.norm: Tensor = C.norm(dim=1)  # [p] Pa s
-        self.inverse_blocks: Tensor = self._inverse_blocks(C)  # [node, 3, 3] 1/kg
+        else:
+            self.symmetric = bool((square - square.mT).abs().max() <= 1e-5 * square.abs().max())
 
     def stiff(self, x: Tensor, *, transposed: bool = False) -> Tensor:
         """K x or K^T x [kg x]."""
@@ -51,11 +61,11 @@ class Tangent:
         launches.on_particles("stiffness")
         if turned:
             square.copy_(square.mT.clone())
-        return total(product).clone()
+        return total(product)[:, :3].to(x.dtype, copy=True)
 
     def block(self, x: Tensor) -> Tensor:
         """D^-1 x, D the diagonal blocks of M + K."""
-        return (self.inverse_blocks * x[:, None, :]).sum(2)
+        return torch.bmm(self.inverse_blocks, x[:, :, None])[:, :, 0]
 
     def _inverse_blocks(self, C: Tensor) -> Tensor:
         system, n = self.system, len(C)
