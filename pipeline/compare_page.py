@@ -128,9 +128,10 @@ def section(scene: str, rows: list[Row], lost: dict[str, str]) -> list[str]:
     return lines
 
 
-def rank(method: str) -> tuple[bool, bool, bool, str]:
-    """Pictures without physics first, then peers, ablations and the whole method."""
-    return method == WHOLE, method.startswith("without"), method not in (FROZEN, FIELD), method
+def rank(method: str) -> tuple[bool, bool, bool, bool, str]:
+    """What was filmed first, then pictures without physics, peers, ablations and the whole method."""
+    without_physics = method in (FROZEN, FIELD)
+    return method != FILMED, method == WHOLE, method.startswith("without"), not without_physics, method
 
 
 def command(scenes: list[str], words: list[str]) -> str:
@@ -200,15 +201,16 @@ def plot(rows: list[Row]) -> Any:
     from matplotlib.figure import Figure
 
     scenes = list(dict.fromkeys(row.scene for row in rows))
+    methods = sorted({row.method for row in rows if "psnr" in row.scores}, key=rank)
     figure = Figure(figsize=(5.2 * len(scenes), 4.0), layout="constrained")
     for axis, scene in zip(figure.subplots(1, len(scenes), squeeze=False)[0], scenes):
-        for row in rows:
+        for row in sorted(rows, key=lambda row: rank(row.method)):
             if row.scene != scene or "psnr" not in row.scores:
                 continue
             if row.seconds is None:
                 axis.axhline(row.scores["psnr"], color="0.5", linestyle=":", label=row.method)
             else:
-                axis.plot(row.seconds, row.scores["psnr"], "o", label=row.method)
+                axis.plot(row.seconds, row.scores["psnr"], "o", color=f"C{methods.index(row.method)}", label=row.method)
         axis.set(title=scene, xlabel="run time [s]", ylabel="PSNR of the unseen motion [dB]", xscale="log")
         axis.legend(fontsize=7)
     return figure
@@ -219,7 +221,7 @@ def sheet(path: Path, rows: list[Row]) -> None:
     import numpy as np
     from matplotlib.figure import Figure
 
-    shown = [row for row in rows if row.video is not None]
+    shown = sorted((row for row in rows if row.video is not None), key=lambda row: rank(row.method))
     if not shown:
         return
     count = min(len(row.video) for row in shown)
