@@ -180,15 +180,15 @@ def page(rows: list[Row], missing: str, *, twins: int, draws: int, steps: int) -
         "",
         f"{steps} steps of Adam; E/mode at the end. The solver is the project's own, with large rotations, and did not",
         "make the films. A search, as in `learn`, looks at five factors on the start by the denoising loss, from",
-        f"1/{SPAN:g} to {SPAN:g}; none of them is the answer. Seconds are those of a clock, with the search.",
+        f"1/{SPAN:g} to {SPAN:g}; none of them is the answer. Seconds are those of one processor, with the search.",
         "",
         "| prior | noise | moved by | estimator | twin | from 1/4 | from 4 | s each |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for prior, (span, by, name, twin), group in grouped(rows, "distil", "range", "by", "estimator", "twin"):
         ends = [row["found"] for row in sorted(group, key=lambda row: row["start"])]
-        seconds = np.mean([row["seconds"] for row in group])
-        lines.append(f"| {prior} | {span} | {by} | {name} | {twin} | {ends[0]:.2f} | {ends[-1]:.2f} | {seconds:.0f} |")
+        seconds = np.mean([row["processor_seconds"] for row in group])
+        lines.append(f"| {prior} | {span} | {by} | {name} | {twin} | {ends[0]:.2f} | {ends[-1]:.2f} | {seconds:.1f} |")
     if missing:
         lines += ["", f"tiny_video is left out: {missing}"]
     return "\n".join(lines) + "\n"

@@ -2,6 +2,7 @@
 time), and a sheet of pictures for each scene. Each file is complete under its name, or not there."""
 
 import csv
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -118,7 +119,8 @@ def section(scene: str, rows: list[Row], lost: dict[str, str]) -> list[str]:
         cells = [cell(row.scores.get(m), best[m]) for m in measures]
         lines.append(f"| {row.method} | {' | '.join(cells)} | {'' if row.seconds is None else round(row.seconds)} |")
     for method, why in lost.items():
-        lines.append(f"| {method} | not done: {why.replace('|', '/')} |" + " |" * len(measures))
+        why = re.sub(r" \(traceback: .*\)$", "", why).replace("|", "/")  # a file of this machine tells no reader
+        lines.append(f"| {method} | not done: {why} |" + " |" * len(measures))
     lines += ["", *ties(rows), ""]
     lines += [f"- {row.method} learned {n}: {v}" for row in table for n, v in row.learned.items()]
     if any(row.video is not None for row in rows):
@@ -126,9 +128,10 @@ def section(scene: str, rows: list[Row], lost: dict[str, str]) -> list[str]:
     return lines
 
 
-def rank(method: str) -> tuple[bool, bool, bool, str]:
-    """Pictures without physics first, then peers, ablations and the whole method."""
-    return method == WHOLE, method.startswith("without"), method not in (FROZEN, FIELD), method
+def rank(method: str) -> tuple[bool, bool, bool, bool, str]:
+    """What was filmed first, then pictures without physics, peers, ablations and the whole method."""
+    without_physics = method in (FROZEN, FIELD)
+    return method != FILMED, method == WHOLE, method.startswith("without"), not without_physics, method
 
 
 def command(scenes: list[str], words: list[str]) -> str:
@@ -198,15 +201,16 @@ def plot(rows: list[Row]) -> Any:
     from matplotlib.figure import Figure
 
     scenes = list(dict.fromkeys(row.scene for row in rows))
+    methods = sorted({row.method for row in rows if "psnr" in row.scores}, key=rank)
     figure = Figure(figsize=(5.2 * len(scenes), 4.0), layout="constrained")
     for axis, scene in zip(figure.subplots(1, len(scenes), squeeze=False)[0], scenes):
-        for row in rows:
+        for row in sorted(rows, key=lambda row: rank(row.method)):
             if row.scene != scene or "psnr" not in row.scores:
                 continue
             if row.seconds is None:
                 axis.axhline(row.scores["psnr"], color="0.5", linestyle=":", label=row.method)
             else:
-                axis.plot(row.seconds, row.scores["psnr"], "o", label=row.method)
+                axis.plot(row.seconds, row.scores["psnr"], "o", color=f"C{methods.index(row.method)}", label=row.method)
         axis.set(title=scene, xlabel="run time [s]", ylabel="PSNR of the unseen motion [dB]", xscale="log")
         axis.legend(fontsize=7)
     return figure
@@ -217,7 +221,7 @@ def sheet(path: Path, rows: list[Row]) -> None:
     import numpy as np
     from matplotlib.figure import Figure
 
-    shown = [row for row in rows if row.video is not None]
+    shown = sorted((row for row in rows if row.video is not None), key=lambda row: rank(row.method))
     if not shown:
         return
     count = min(len(row.video) for row in shown)

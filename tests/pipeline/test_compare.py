@@ -31,7 +31,10 @@ ROWS = [
 
 
 def test_every_number_is_on_the_page_and_the_best_is_bold(tmp_path):
-    lost = {("hat", "physics3d"): "capture: no photographs", ("cake", "physgaussian"): "render: nothing"}
+    lost = {
+        ("hat", "physics3d"): "capture: no photographs",
+        ("cake", "physgaussian"): "render: nothing (traceback: /x/y.txt)",
+    }
     write(tmp_path, ROWS, lost, {"seed": 7, "device": "cpu"}, words=["profile=smoke", "output=/x", "learn.steps=3"])
     text = (tmp_path / "compare.md").read_text()
     cake = text[text.index("## cake") : text.index("## hat")]
@@ -41,7 +44,7 @@ def test_every_number_is_on_the_page_and_the_best_is_bold(tmp_path):
     assert "**" not in rows["frozen first frame"] and "| 25 |" in rows["frozen first frame"]
     assert {line.count("|") for line in rows.values()} == {2 + 3}, "two measures are known of any method"
     assert list(rows) == ["method", "frozen first frame", "without_filling", "physics3d", "physgaussian"]
-    assert "not done: render: nothing" in rows["physgaussian"]
+    assert "| not done: render: nothing |" in rows["physgaussian"]
     assert "| physics3d | not done: capture: no photographs |" in text[text.index("## hat") :]
     assert '`make compare SCENES=cake,hat PROFILE=smoke ARGS="learn.steps=3"`, seed 7' in text
     assert "1e5 (between 8e4 and 1.2e5)" in text
