@@ -81,7 +81,7 @@ sweep: $(ready) ## many runs at once: SCENES=carnation,ball METHODS=... SEEDS=0,
 	@$(threads) $(with_args) -m pipeline.sweep scenes="$$SCENES" methods="$$METHODS" seeds="$$SEEDS" runner="$$RUNNER" workers="$$WORKERS" \
 		address="$$ADDRESS" profile="$$PROFILE" $${DATA:+data="$$DATA"}
 
-compare: $(ready) ## every method on SCENES=carnation,cake, the paper's table: [METHODS=...] [OUT=<folder>]
+compare: $(ready) ## every method on SCENES=carnation,cake, the paper's table: [PROFILE=smoke] [METHODS=...] [OUT=<folder>]
 	@$(threads) $(with_args) -m pipeline.compare scenes="$${SCENES:-$$SCENE}" methods="$$METHODS" $${RUNNER:+runner="$$RUNNER"} \
 		$${WORKERS:+workers="$$WORKERS"} $${OUT:+out="$$OUT"} profile="$$PROFILE" $${DATA:+data="$$DATA"}
 

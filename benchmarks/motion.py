@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from machine import machine
 
-from physics3d.metrics.image import ms_ssim, psnr_per_frame, ssim_per_frame
+from physics3d.metrics.image import likeness
 from physics3d.metrics.video import vmaf
 from physics3d.motion.clip import read_clip
 from physics3d.motion.decay import Decay
@@ -62,8 +62,9 @@ def main(words: list[str]) -> None:
             predictions = stills(clip.frames, seen=seen)
             predictions[MODES] = modes.frames(range(seen, len(clip.frames)))
             for name, prediction in predictions.items():
-                rows.append(dict(thing=thing, take=i, seen=seen, row=name, **scores(prediction, future)))
-                lines.setdefault(f"{thing} {i}", {})[name] = psnr_per_frame(prediction, future)
+                cells, line = scores(prediction, future)
+                rows.append(dict(thing=thing, take=i, seen=seen, row=name, **cells))
+                lines.setdefault(f"{thing} {i}", {})[name] = line
             whole = image_modes(clip.frames, clip.fps)
             signal = measured(modes, clip.frames)
             decays.append(dict(thing=thing, take=i, modes=modes, whole=whole, measured=signal))
@@ -86,16 +87,15 @@ def told(thing: str, teacher: tuple[int, ImageModes], take: int, frames: torch.T
     still = stills(frames, seen=SEEN_OF_OTHERS)[LAST]
     head = dict(thing=thing, take=take, seen=SEEN_OF_OTHERS)
     named = {LAST: still, MODES: own, TOLD.format(teacher[0]): prediction}
-    return [dict(**head, row=name, **scores(video, future)) for name, video in named.items()]
+    return [dict(**head, row=name, **scores(video, future)[0]) for name, video in named.items()]
 
 
-def scores(video: torch.Tensor, future: torch.Tensor) -> dict[str, float | None]:
-    return {
-        "psnr": float(np.mean(psnr_per_frame(video, future))),
-        "ssim": float(np.mean(ssim_per_frame(video, future))),
-        "ms_ssim": ms_ssim(video, future)[0],
-        "vmaf": vmaf(video, future)[0],
-    }
+def scores(video: torch.Tensor, future: torch.Tensor) -> tuple[dict[str, float | None], list[float]]:
+    """(means over frames, PSNR of every frame)."""
+    like = likeness(video, future)
+    line = like.psnr_per_frame
+    cells = {"psnr": float(np.mean(line)), "ssim": float(np.mean(like.ssim)), "vmaf": vmaf(video, future)[0]}
+    return cells | {"ms_ssim": None if like.ms_ssim is None else float(np.mean(like.ms_ssim))}, line
 
 
 def write(rows: list[dict], decays: list[dict], lines: dict, left_out: list[str]) -> None:

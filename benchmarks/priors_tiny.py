@@ -22,6 +22,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,7 @@ RESULTS = Path(__file__).resolve().parent.parent / "docs" / "results"
 UNSEEN = 20_000  # number of the first form: training takes 0, 1, ..., its own check 10000, ...
 SEED = 0
 FAR = math.log(4.0)
+SPAN = 5.0  # of the search: factors of a half to 2 from a start that is 4 off would land on the answer
 GRID = np.linspace(-1.75, 1.75, 29)
 STEP = 0.02  # of the central differences of a clip
 RANGES = ((1.0, 5.0), (3.0, 30.0), (10.0, 60.0))  # of sigma/alpha
@@ -186,11 +188,7 @@ def tiny(weights: str | None) -> PriorOf:
 def read_gradient(theta: np.ndarray, found: np.ndarray) -> Row:
     """Of gradients [draws, theta]: the zero nearest to 0 that descent goes to, and how well single draws see it."""
     mean, deviation = found.mean(0), found.std(0, ddof=1)
-    zeros = [
-        (theta[i] - mean[i] * (theta[i + 1] - theta[i]) / (mean[i + 1] - mean[i]), (mean[i + 1] - mean[i]))
-        for i in range(len(theta) - 1)
-        if mean[i] < 0 < mean[i + 1]
-    ]
+    zeros = crossings(theta, mean)
     middle = int(np.abs(theta).argmin())
     row = dict(
         mean_low=float(mean[int(np.abs(theta + FAR).argmin())]),
@@ -202,7 +200,7 @@ def read_gradient(theta: np.ndarray, found: np.ndarray) -> Row:
     )
     if not zeros:
         return row | dict(bias=math.nan, spread=math.nan, low=math.nan, high=math.nan)
-    bias, rise = min(zeros, key=lambda zero: abs(zero[0]))
+    bias, slope = min(zeros, key=lambda zero: abs(zero[0]))
     first_above = int(np.searchsorted(theta, bias))
     # the basin: as far as the mean gradient keeps its sign on either side
     low, high = first_above - 1, first_above
@@ -210,8 +208,22 @@ def read_gradient(theta: np.ndarray, found: np.ndarray) -> Row:
         low -= 1
     while high < len(theta) - 1 and mean[high + 1] > 0:
         high += 1
-    spread = deviation[middle] * (theta[1] - theta[0]) / rise  # of theta, by one draw
+    spread = deviation[middle] / slope  # of theta, by one draw
     return row | dict(bias=float(bias), spread=float(spread), low=float(theta[low]), high=float(theta[high]))
+
+
+def crossings(theta: np.ndarray, mean: np.ndarray) -> list[tuple[float, float]]:
+    """(place, slope) of every zero that descent goes to: a mean gradient that is negative on its left and positive on
+    its right. That of an exact denoiser may vanish on the grid itself, there and on no other place."""
+    found = []
+    for left, right in pairwise(np.flatnonzero(mean)):
+        if not mean[left] < 0 < mean[right]:
+            continue
+        slope = (mean[right] - mean[left]) / (theta[right] - theta[left])
+        on_grid = theta[left + 1 : right]
+        place = on_grid.mean() if len(on_grid) else theta[left] - mean[left] / slope
+        found.append((float(place), float(slope)))
+    return found
 
 
 def distil(
@@ -251,9 +263,9 @@ def distil(
 
 
 def search(prior: AbstractPrior, condition: Any, twin: Twin, solver: Solver | None, start: float) -> float:
-    """The best of five factors from 1/4 to 4 on the start, all with the same noise."""
+    """The best of five factors from 1/SPAN to SPAN on the start, all with the same noise."""
     found = {}
-    for theta in start + np.linspace(-FAR, FAR, 5):
+    for theta in start + np.linspace(-math.log(SPAN), math.log(SPAN), 5):
         here = torch.tensor(theta, dtype=torch.float64)
         with torch.no_grad():
             clip = twin.clip(here) if solver is None else twin.solved(solver, here)

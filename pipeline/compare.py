@@ -4,27 +4,25 @@
 
 Every method of conf/method runs on every scene, as `make sweep` runs them: what they have in common is computed once,
 and a second call goes on where the first was stopped. Beside them stand the first picture frozen and, where a motion
-was recorded whose cause is known, a deformation field without physics that is fitted to it
-(`physics3d/learning/deformation_field.py`). All are judged by the take that nobody learned from. Of real takes, whose
-cause nobody knows, there is the table of what is foretold; METHODS=physics3d is enough for them.
+was recorded whose cause is known, a deformation field without physics that is fitted to it (`stages/deform.py`). All
+are judged by the take that nobody learned from. Of real takes, whose cause nobody knows, there is the table of what is
+foretold; METHODS=physics3d is enough for them. What could not be computed stands in the table with the reason.
 
-`compare_page.py` says what is written. Exit codes as `make sweep`.
+PROFILE=smoke takes minutes for a scene. `compare_page.py` says what is written. Exit codes as `make sweep`.
 """
 
 import sys
-import time
 from pathlib import Path
-from typing import Any
 
-from pipeline.compare_page import FIELD, FILMED, METRICS, Row, write
-from pipeline.filed import filed, one_line
+from pipeline.compare_page import FIELD, FILMED, FROZEN, METRICS, WHOLE, Row, write
+from pipeline.filed import one_line
+from pipeline.flow import Plan, first, plan
 from pipeline.places import folder_to_fill
 from pipeline.settings import SettingsError, choices
-from pipeline.stage import StageError, Step, build, here, manifest
+from pipeline.shelf import using
+from pipeline.stage import StageError, Step, here, manifest, peek, run
 from pipeline.sweep import OWN, Variant, asked, swept
-from pipeline.told import Table, parameters, scores
-
-WHOLE = "physics3d"
+from pipeline.told import Parameter, Table, parameters, scores
 
 
 def main(words: list[str]) -> int:
@@ -51,23 +49,28 @@ def compare(words: list[str]) -> int:
     rows: list[Row] = []
     lost: dict[tuple[str, str], str] = {}
     for variant in variants:
-        state = str(states[variant]["state"])
-        if state != "done":
+        if (state := str(states[variant]["state"])) != "done":
             lost[variant.scene, variant.method] = state
+            if variant.method == WHOLE:
+                lost[variant.scene, FIELD] = lost[variant.scene, FROZEN] = f"{WHOLE} did not end"
             continue
-        rows += of_variant(variant, rest)
+        for method, make in ((variant.method, of_variant), (FIELD, deformed)):
+            try:
+                rows += make(variant)
+            except StageError as error:
+                lost[variant.scene, method] = str(error)
     if not rows:
         raise StageError(f"no method ended on any scene: {next(iter(lost.values()))}")
-    write(folder, rows, lost, variants[0].config)
+    write(folder, rows, lost, variants[0].config, words=rest)
     print(f"comparison {folder / 'compare.md'}")
     return 1 if lost else 0
 
 
-def of_variant(variant: Variant, rest: list[str]) -> list[Row]:
+def of_variant(variant: Variant) -> list[Row]:
     """The row of a run; with the whole method also those of what needs no run of its own."""
     from pipeline.moving import read
 
-    _, whole, steps = filed([f"scene={variant.scene}", f"method={variant.method}", *rest])
+    whole, steps = planned(variant)
     tables = scores(whole)
     if not tables:
         raise StageError(f"{variant.scene} has no recorded motion to compare with; leave it out of SCENES")
@@ -80,7 +83,7 @@ def of_variant(variant: Variant, rest: list[str]) -> list[Row]:
         method=variant.method,
         scores=_numbers(table, name),
         seconds=sum(_seconds(step) for step in steps.values() if not step.name.endswith("_initial")),
-        learned={p.name: f"{p.learned:.3g} ({p.between})" for p in parameters(whole) if p.low is not None},
+        learned={p.name: _found(p) for p in parameters(whole) if p.low is not None},
         video=read(steps["render"]).frames[0],
     )
     if not is_whole:
@@ -90,45 +93,61 @@ def of_variant(variant: Variant, rest: list[str]) -> list[Row]:
     camera = (take.held_out_cameras or (0,))[0]
     filmed = Row(scene=variant.scene, method=FILMED, scores={}, video=take.videos[camera])
     still = [Row(scene=variant.scene, method=n, scores=_numbers(table, n)) for n in table.values if "frozen" in n]
-    return [filmed, *still, *deformed(variant, capture, steps), found]
+    return [filmed, *still, found]
+
+
+def planned(variant: Variant) -> tuple[Plan, dict[str, Step]]:
+    """Plan and steps by name of a variant whose steps are filed, by the configuration that they were computed with."""
+    shelf = Path(variant.config["output"]).expanduser().resolve() / "artifacts"
+    whole = plan(variant.config, first(variant.config, shelf))
+    return whole, {step.name: step for step in whole.steps}
 
 
 def _numbers(table: Table, row: str) -> dict[str, float]:
     return {k: v for k, v in table.values[row].items() if k in METRICS and v is not None}
 
 
+def _found(parameter: Parameter) -> str:
+    """What was learned, in words."""
+    truth = "" if parameter.truth is None else f"truth {parameter.truth:.3g}, "
+    return f"{parameter.learned:.3g} ({truth}{parameter.between})"
+
+
 def _seconds(step: Step) -> float:
     return float(manifest(step)["seconds"])
 
 
-def deformed(variant: Variant, capture: Any, steps: dict[str, Step]) -> list[Row]:
-    """The row of the deformation field, fitted to the take that the others learned from; none where there is no such
-    take."""
-    import torch
-
-    from physics3d.learning.chain import chain_of
-    from physics3d.learning.deformation_field import fit_field
-    from physics3d.log import Log
+def deformed(variant: Variant) -> list[Row]:
+    """The row of the deformation field, fitted to the take that the others learned from, beside that of the whole
+    method; none where there is no such take, or nobody knows what set it going."""
     from pipeline.moving import read
 
-    take = capture.take("learn")
-    if take is None:
+    config, (_, steps) = variant.config, planned(variant)
+    if variant.method != WHOLE or "learn" not in steps or "evaluate" not in steps:
         return []
-    gaussians, body = read(steps["reconstruct"]) if "reconstruct" in steps else capture.gaussians, read(steps["fill"])
-    device = here(variant.config["device"])
-    learn, render, evaluate = (build(variant.config[name], device, name) for name in ("learn", "render", "evaluate"))
-    began = time.perf_counter()
-    chain = chain_of(
-        learn.world, learn.prior, learn.estimator, learn.field(learn.world.estimate(), speed=1.0), capture, gaussians,
-        body, take, torch.arange(len(take.videos[0])), image_scale=learn.image_scale, device=device, log=Log(None),
-    )  # fmt: skip
-    trajectory = fit_field(chain, body, fps=take.fps, seed=learn.seed, log=Log(None))
-    video = render(capture, gaussians, body, trajectory, log=Log(None))
-    seconds = sum(_seconds(steps[n]) for n in ("capture", "reconstruct", "segment", "fill") if n in steps)
-    seconds += time.perf_counter() - began
-    cells = evaluate(capture, {FIELD: video}, {}, log=Log(None)).values[FIELD]
-    values = {k: v for k, v in cells.items() if k in METRICS and v is not None}
-    return [Row(scene=variant.scene, method=FIELD, scores=values, seconds=seconds, video=video.frames[0])]
+    device = here(config["device"])
+    shared = {"device": config["device"], "seed": config["seed"]}
+    fitted = {"_target_": "stages.deform.Deform", "prior": config["learn"]["prior"]}
+    fitted |= {"image_scale": config["learn"]["image_scale"], **shared}
+    capture, body, shelf = steps["capture"], steps["fill"], steps["capture"].shelf
+    gaussians = steps.get("reconstruct") or capture.part("gaussians")
+    motion = Step.of("deform", "deform", fitted, (capture, gaussians, body), shelf)
+    video = Step.of("render_deformed", "render", config["render"], (capture, gaussians, body, motion), shelf)
+    judged = Step.of("evaluate_deformed", "evaluate", config["evaluate"], (capture, {FIELD: video}, {}), shelf)
+    with using(shelf):
+        for step in (motion, video, judged):
+            run(step, device, config["verify"])
+    table = Table(step="evaluate", values=peek(judged.folder)["values"])
+    needed = [steps[n] for n in ("capture", "reconstruct", "segment", "fill") if n in steps]
+    return [
+        Row(
+            scene=variant.scene,
+            method=FIELD,
+            scores=_numbers(table, FIELD),
+            seconds=sum(map(_seconds, (*needed, motion, video, judged))),
+            video=read(video).frames[0],
+        )
+    ]
 
 
 if __name__ == "__main__":

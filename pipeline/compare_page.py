@@ -2,15 +2,18 @@
 time), and a sheet of pictures for each scene. Each file is complete under its name, or not there."""
 
 import csv
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from pipeline.filed import beside
 from pipeline.settings import CONF, choices, described
+from pipeline.stage import here
 
 FIELD, FROZEN, FILMED = "deformation_field", "frozen first frame", "filmed"
 METRICS = ("psnr", "ssim", "ms_ssim", "vmaf", "motion_psnr", "flow_error")
+WHOLE = "physics3d"  # the method with which the others compare
 INSTANTS = 6  # pictures of a sheet
 
 
@@ -48,8 +51,11 @@ def better(filmed: Any, one: Any, other: Any, *, seed: int = 0) -> tuple[float, 
     return float(gain.mean()), float(np.quantile(means, 0.05)), float(np.quantile(means, 0.95))
 
 
-def write(folder: Path, rows: list[Row], lost: dict[tuple[str, str], str], config: dict[str, Any]) -> None:
-    """Raises OSError if there is no room."""
+def write(
+    folder: Path, rows: list[Row], lost: dict[tuple[str, str], str], config: dict[str, Any], *, words: list[str]
+) -> None:
+    """`lost`: (scene, method) -> why there is no row; `words` said more than scenes and methods, e.g. profile=smoke.
+    Raises OSError if there is no room."""
     folder.mkdir(parents=True, exist_ok=True)
     with beside(folder / "compare.csv", over=True) as hidden, hidden.open("w", newline="") as file:
         writer = csv.DictWriter(file, ["scene", "method", "seconds", *METRICS], restval="")
@@ -57,54 +63,108 @@ def write(folder: Path, rows: list[Row], lost: dict[tuple[str, str], str], confi
         writer.writerows({"scene": r.scene, "method": r.method, "seconds": r.seconds, **r.scores} for r in rows)
     with beside(folder / "compare.png", over=True) as hidden:
         plot(rows).savefig(hidden, dpi=100)
-    scenes = list(dict.fromkeys(row.scene for row in rows))
+    scenes = list(dict.fromkeys([*(row.scene for row in rows), *(scene for scene, _ in lost)]))
     for scene in scenes:
         sheet(folder / f"compare_{scene}.jpg", [row for row in rows if row.scene == scene])
     with beside(folder / "compare.md", over=True) as hidden:
-        hidden.write_text(page(rows, lost, scenes, config))
+        hidden.write_text(page(rows, lost, scenes, config, words))
 
 
-def page(rows: list[Row], lost: dict[tuple[str, str], str], scenes: list[str], config: dict[str, Any]) -> str:
+def page(
+    rows: list[Row], lost: dict[tuple[str, str], str], scenes: list[str], config: dict[str, Any], words: list[str]
+) -> str:
     """compare.md."""
-    words = {name: described(CONF / "method" / f"{name}.yaml") for name in choices("method")}
-    words |= {
+    from physics3d.machine import machine
+
+    told = {name: described(CONF / "method" / f"{name}.yaml") for name in choices("method")}
+    told |= {
         FROZEN: "the first picture, standing still",
         FIELD: "a deformation field without physics, fitted to the recorded clip (the peer is DreamGaussian4D)",
     }
-    used = dict.fromkeys(row.method for row in rows if row.scores)
+    used = sorted({row.method for row in rows if row.scores}, key=rank)
     lines = [
         "# Methods compared",
         "",
-        f"`make compare SCENES={','.join(scenes)}`, seed {config['seed']}. All learn from one recorded motion and are",
-        "judged by another one, of another force, that nobody saw. More is better, but for the error of the flow,",
-        "which is relative to the motion: 1 is that of a picture that stands still. Seconds are those of all stages",
-        "that a method needs, on the machine that ran them, which may have had other work. Intervals hold with a",
-        "probability of 90 %.",
+        f"`{command(scenes, words)}`, seed {config['seed']}. Written on {machine(here(config['device']))}.",
         "",
-        *(f"- **{name}**: {words.get(name, name)}" for name in used),
+        "All learn from one recorded motion and are judged by another one, of another force, that nobody saw. More is",
+        "better, but for the error of the flow, which is relative to the motion: 1 is that of a picture that stands",
+        "still. Seconds are those of all stages that a method needs, on the machine that ran them, which may have had",
+        "other work. Intervals hold with a probability of 90 %.",
+        "",
+        *(f"- **{name}**: {told.get(name, name)}" for name in used),
+        "",
+        *overall(rows, lost, scenes),
         "",
         "![error against run time](compare.png)",
     ]
     for scene in scenes:
         of_scene = [row for row in rows if row.scene == scene]
-        table = [row for row in of_scene if row.scores]
-        lines += ["", f"## {scene}", "", "| method | " + " | ".join(m.replace("_", " ") for m in METRICS) + " | s |"]
-        lines += ["|---" * (len(METRICS) + 2) + "|"]
-        best = {}
-        for m in METRICS:
-            known = [row.scores[m] for row in table if m in row.scores]
-            best[m] = (min if m == "flow_error" else max)(known, default=None)
-        for row in table:
-            cells = [cell(row.scores.get(m), best[m]) for m in METRICS]
-            lines.append(
-                f"| {row.method} | {' | '.join(cells)} | {'' if row.seconds is None else round(row.seconds)} |"
-            )
-        lines += ["", *ties(of_scene), ""]
-        lines += [f"- {row.method} learned {n}: {v}" for row in table for n, v in row.learned.items()]
-        if any(row.video is not None for row in rows if row.scene == scene):
-            lines += ["", f"![{scene}: what was filmed, and the methods at the same instants](compare_{scene}.jpg)"]
-    lines += [f"\n{scene}, {method}: not done, {why}" for (scene, method), why in lost.items()]
+        lines += section(scene, of_scene, {method: why for (s, method), why in lost.items() if s == scene})
     return "\n".join(lines) + "\n"
+
+
+def section(scene: str, rows: list[Row], lost: dict[str, str]) -> list[str]:
+    """The tables and the sheet of one scene; `lost`: method -> why there is no row."""
+    table = sorted((row for row in rows if row.scores), key=lambda row: rank(row.method))
+    # what pictures are too small for, or a thing moves too little, is no column
+    measures = [m for m in METRICS if any(m in row.scores for row in table)]
+    lines = ["", f"## {scene}", "", "| method | " + " | ".join(m.replace("_", " ") for m in measures) + " | s |"]
+    lines += ["|---" * (len(measures) + 2) + "|"]
+    best = {}
+    for m in measures:
+        known = [row.scores[m] for row in table if m in row.scores]
+        best[m] = (min if m == "flow_error" else max)(known)
+    for row in table:
+        cells = [cell(row.scores.get(m), best[m]) for m in measures]
+        lines.append(f"| {row.method} | {' | '.join(cells)} | {'' if row.seconds is None else round(row.seconds)} |")
+    for method, why in lost.items():
+        why = re.sub(r" \(traceback: .*\)$", "", why).replace("|", "/")  # a file of this machine tells no reader
+        lines.append(f"| {method} | not done: {why} |" + " |" * len(measures))
+    lines += ["", *ties(rows), ""]
+    lines += [f"- {row.method} learned {n}: {v}" for row in table for n, v in row.learned.items()]
+    if any(row.video is not None for row in rows):
+        lines += ["", f"![{scene}: what was filmed, and the methods at the same instants](compare_{scene}.jpg)"]
+    return lines
+
+
+def rank(method: str) -> tuple[bool, bool, bool, bool, str]:
+    """What was filmed first, then pictures without physics, peers, ablations and the whole method."""
+    without_physics = method in (FROZEN, FIELD)
+    return method != FILMED, method == WHOLE, method.startswith("without"), not without_physics, method
+
+
+def command(scenes: list[str], words: list[str]) -> str:
+    """What makes this page."""
+    said = dict(word.partition("=")[::2] for word in words)
+    said.pop("output", None)  # where results lie makes none of them
+    named = [f"{name.upper()}={said.pop(name)}" for name in ("profile", "data") if name in said]
+    more = [f'ARGS="{" ".join(f"{k}={v}" for k, v in said.items())}"'] if said else []
+    return " ".join(["make compare", f"SCENES={','.join(scenes)}", *named, *more])
+
+
+def overall(rows: list[Row], lost: dict[tuple[str, str], str], scenes: list[str]) -> list[str]:
+    """The PSNR of every method on every scene, and means over the scenes on which every method that ran ended."""
+    of = {(row.scene, row.method): row.scores["psnr"] for row in rows if "psnr" in row.scores}
+    methods = sorted({m for _, m in of} | {m for _, m in lost}, key=rank)
+    ran = [method for method in methods if method in (*choices("method"), FIELD, FROZEN)]
+    whole = [scene for scene in scenes if all((scene, method) in of for method in ran)]
+    mean = {m: sum(of[scene, m] for scene in whole) / len(whole) for m in ran} if whole else {}
+    best = {scene: max((of[scene, m] for m in methods if (scene, m) in of), default=None) for scene in scenes}
+    lines = [
+        f"PSNR of the unseen motion in dB; the mean is that of {len(whole)} of {len(scenes)} scenes, on which every",
+        "method ended.",
+        "",
+        "| method | " + " | ".join(scenes) + " | mean |",
+        "|---" * (len(scenes) + 2) + "|",
+    ]
+    for method in methods:
+        cells = [
+            "not done" if (scene, method) in lost else cell(of.get((scene, method)), best[scene]) for scene in scenes
+        ]
+        last = cell(mean.get(method), max(mean.values(), default=None))
+        lines.append(f"| {method} | {' | '.join(cells)} | {last} |")
+    return lines
 
 
 def ties(rows: list[Row]) -> list[str]:
@@ -141,15 +201,16 @@ def plot(rows: list[Row]) -> Any:
     from matplotlib.figure import Figure
 
     scenes = list(dict.fromkeys(row.scene for row in rows))
+    methods = sorted({row.method for row in rows if "psnr" in row.scores}, key=rank)
     figure = Figure(figsize=(5.2 * len(scenes), 4.0), layout="constrained")
     for axis, scene in zip(figure.subplots(1, len(scenes), squeeze=False)[0], scenes):
-        for row in rows:
+        for row in sorted(rows, key=lambda row: rank(row.method)):
             if row.scene != scene or "psnr" not in row.scores:
                 continue
             if row.seconds is None:
                 axis.axhline(row.scores["psnr"], color="0.5", linestyle=":", label=row.method)
             else:
-                axis.plot(row.seconds, row.scores["psnr"], "o", label=row.method)
+                axis.plot(row.seconds, row.scores["psnr"], "o", color=f"C{methods.index(row.method)}", label=row.method)
         axis.set(title=scene, xlabel="run time [s]", ylabel="PSNR of the unseen motion [dB]", xscale="log")
         axis.legend(fontsize=7)
     return figure
@@ -160,7 +221,7 @@ def sheet(path: Path, rows: list[Row]) -> None:
     import numpy as np
     from matplotlib.figure import Figure
 
-    shown = [row for row in rows if row.video is not None]
+    shown = sorted((row for row in rows if row.video is not None), key=lambda row: rank(row.method))
     if not shown:
         return
     count = min(len(row.video) for row in shown)

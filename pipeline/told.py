@@ -110,13 +110,20 @@ def models(plan: Plan) -> list[str]:
     """Which simpler models the clip leaves open, and which recording would settle it: a sentence each."""
     steps = {step.name: step for step in plan.steps}
     learned = peek(steps["learn"].folder) if "learn" in steps else {}
-    odds, next_ones = learned.get("models", {}), learned.get("film_next", {})
+    return of_models(learned.get("models", {}), learned.get("film_next", {}))
+
+
+def of_models(odds: dict[str, float], film_next: dict[str, float]) -> list[str]:
+    """Both as of an `Estimate`; what tells most comes first."""
     verdict = lambda value: "explains the clip as well: a tie" if value < TIE else "does not explain the clip"
-    said = [f"{name}: {verdict(value)} (ln B {value:+.1f})" for name, value in odds.items()]
-    for name, value in sorted(next_ones.items(), key=lambda one: -one[1]):
-        settles = "should settle it" if value >= TIE else "would hardly settle it"
-        said.append(f"to film next: {name}: {settles} (ln B {value:+.1f})")
-    return said
+    settles = lambda value: "should settle it" if value >= TIE else "would hardly settle it"
+    return [
+        *(f"{name}: {verdict(value)} (ln B {value:+.1f})" for name, value in odds.items()),
+        *(
+            f"to film next: {name}: {settles(value)} (ln B {value:+.1f})"
+            for name, value in sorted(film_next.items(), key=lambda one: -one[1])
+        ),
+    ]
 
 
 def scores(plan: Plan) -> list[Table]:

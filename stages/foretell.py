@@ -67,10 +67,10 @@ class Foretell:
         pose = {name: None if reference is None else motion.at(reference) for name, motion in motions.items()}
         if has_stopped(ready.sight, swing, flow, trusted, fps=take.fps, release=release):
             motions[SEEN] = _stopped(swing, take, notes, log)
-        scores |= self.judged(ready, take, motions, flow[-1], release=release, seen=seen, notes=notes, log=log)
+        scores |= self.judged(ready, take, motions, flow, release=release, seen=seen, notes=notes, log=log)
         for other in capture.takes:
             if other is not take:
-                own = ready if other.posed is None else by_its_own_camera(ready, other, gaussians, body)
+                own = ready if other.posed is None else by_its_own_camera(ready, capture, other, gaussians, body, log)
                 scores |= self.other(own, other, swing, {LEARNED: learned, START: before}, pose, notes, log)
         table = Scores(values=scores, notes=notes)
         table.check()
@@ -107,29 +107,29 @@ class Foretell:
         motions: dict[str, Moving] = {SEEN: swing}
         for name, material in materials.items():
             motions[name] = start(ready.reduced, material, window, known=known[name])[0]
-        return self.judged(ready, take, motions, flow[-1], release=release, seen=seen, notes=notes, log=log)
+        return self.judged(ready, take, motions, flow, release=release, seen=seen, notes=notes, log=log)
 
     def judged(
         self,
         ready: Swung,
         take: Take,
         motions: dict[str, Moving],
-        moved: np.ndarray,
+        flow: np.ndarray,
         *,
         release: int,
         seen: int,
         notes: dict[str, str],
         log: Log,
     ) -> dict[str, dict[str, float | None]]:
-        """Measures and the page of what follows frame `seen` - 1."""
+        """Measures and the page of what follows frame `seen` - 1; `flow` of the frames up to it."""
         frames, fps = take.videos[0], take.fps
         future = frames[seen:]
-        times = (np.arange(seen, len(frames)) - release) / fps
-        last = (seen - 1 - release) / fps
+        times = (np.arange(release, len(frames)) - release) / fps
+        at, times = times[: seen - release], times[seen - release :]
         swing = motions[SEEN]
         assert isinstance(swing, Swing)
         clips: dict[str, Tensor] = {
-            name: foretold(frames[seen - 1], ready.sight, motion, moved, last=last, times=times)
+            name: foretold(frames[release:seen], ready.sight, motion, flow[release:], at=at, times=times)
             for name, motion in motions.items()
         }
         clips[IMAGE] = image_modes(frames[:seen], fps).frames(range(seen, len(frames)))

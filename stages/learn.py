@@ -15,6 +15,7 @@ from physics3d.checks import (
     Device,
     Duration,
     Frames,
+    Length,
     NamesOf,
     NotNegative,
     Positive,
@@ -41,7 +42,7 @@ from physics3d.learning.mirror import NEAR, across, angular_frequency
 from physics3d.learning.polish import polish
 from physics3d.learning.rivals import rivals, widened
 from physics3d.learning.search import search
-from physics3d.learning.stiffness_field import WIDTH, StiffnessField, asked_for, is_node, picture, trilinear
+from physics3d.learning.stiffness_field import WIDTH, StiffnessField, asked_for, is_node, picture, smooth, trilinear
 from physics3d.learning.unknown_cause import learned_free
 from physics3d.learning.valley import reaches
 from physics3d.learning.which_model import compared, film_next, other_end
@@ -95,8 +96,10 @@ class Learn:
     beyond: Beyond = dataclasses.field(default_factory=Beyond)  # widths of what the clip does not show
     largest_gradient: Positive = 3.0  # clip of the global norm, in units of the loss at the start per unit of theta
     zones: Annotated[int, Ge(1), Le(16)] = 4  # of stiffness, where the cause of the motion is unknown
-    # of a field of stiffness, along the body's longest side; taken where the clip asks for it. 0: one stiffness
+    # of a field of stiffness, along the body's longest side; taken where the clip asks for it. 0: none
     nodes: Literal[0] | Annotated[int, Ge(2), Le(32)] = 0
+    # within which a stiffness per particle is alike [m]; taken likewise, in the place of nodes. None: no such field
+    smooth: Length | None = None
     device: Device = "cpu"
     seed: Seed = 0
 
@@ -204,10 +207,11 @@ class Learn:
             said = self.said(whole, seen, log)
         field: AbstractField = whole
         known = history(whole, course)
-        if self.nodes and seen is None:
+        varying = self.varying(body)
+        if varying is not None and seen is None:
             log.info("no field of stiffness: residuals tell whether a clip asks for one, and this prior has none")
-        elif self.nodes and seen is not None:
-            finer = StiffnessField(whole=whole, weights=trilinear(body.position, self.nodes))
+        elif varying is not None and seen is not None:
+            finer = StiffnessField(whole=whole, weights=varying)
             over, more = replace(chained(finer, Log(None)), journal=chain.journal), finer.zero()
             more[: len(theta)] = theta
             more, descent = self.descended(over, finer, more, self.steps or USUAL_STEPS, log)
@@ -377,6 +381,12 @@ class Learn:
             start_velocity=start.velocity,
             velocity_scale=speed if self.learn_velocity else None,
         )
+
+    def varying(self, body: Body) -> Tensor | None:
+        """Weights [p, k] of the field of stiffness that is asked for; None for one stiffness."""
+        if self.smooth is not None:
+            return smooth(body.position, self.smooth)
+        return trilinear(body.position, self.nodes) if self.nodes else None
 
     def natural_speed(self, body: Body, seconds: float) -> float:
         """Its own size per duration of the clip [m/s]: the unit in which the initial velocity is learned."""

@@ -14,8 +14,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from physics3d.filling.body import Body
-from physics3d.learning.loss import Chain
+from physics3d.learning.chain import Draw
 from physics3d.log import Log
+from physics3d.priors.base import AbstractPrior
 from physics3d.trajectory import Trajectory
 
 SMOOTH_IN_TIME = 0.02  # of second differences, in units of the nodes' distance, against the picture's loss
@@ -23,9 +24,11 @@ SMOOTH_IN_SPACE = 0.02
 
 
 def fit_field(
-    chain: Chain,
+    clips: dict[int, Float[Tensor, "t h w 3"]],
+    draw: Draw,
     body: Body,
     *,
+    prior: AbstractPrior,
     fps: float,
     nodes: int = 48,
     steps: int = 150,
@@ -34,33 +37,34 @@ def fit_field(
     seed: int = 0,
     log: Log,
 ) -> Trajectory:
-    """The motion of the body's particles at the frames of the chain's clips.
+    """The motion of the body's particles at the frames of the clips, by number of the camera (`chain.filmed`).
 
-    `chain.render` draws it, `chain.loss` without its simulator judges it; `fps` is the rate of those frames [1/s],
-    `learning_rate` is of the q_k, in units of the nodes' distance.
+    Pictures are compared in the prior's code; `fps` is the rate of the frames [1/s], `learning_rate` is of the q_k, in
+    units of the nodes' distance.
     """
-    X = body.position.to(next(iter(chain.clips.values())).device)
+    first = next(iter(clips.values()))
+    X = body.position.to(first.device)
     centre, reach = spread(X, nodes)
     w, slope = shape_functions(X, centre, reach)
-    t = len(chain.frames)
+    t = len(first)
     q = torch.zeros(
         t - 1, len(centre), 3, device=X.device, requires_grad=True
     )  # in units of the reach; frame 0 is rest
     adam = torch.optim.Adam([q], lr=learning_rate)
     generator = torch.Generator().manual_seed(seed)
     near = torch.cdist(centre, centre).argsort(1)[:, 1:5]
-    views = list(chain.clips)
+    views, moved = list(clips), unit(first, prior)
     for step in (bar := log.progress(range(steps), "deformation field")):
         view = views[int(torch.randint(len(views), (), generator=generator))]
         frames = 1 + torch.randperm(t - 1, generator=generator)[: min(frames_per_step, t - 1)].sort().values
         whole = torch.cat([torch.zeros_like(q[:1]), q])
-        moved = _Moved(position=X + reach * w @ whole, deformation=_gradient(whole, slope, reach))
+        position, deformation = X + reach * w @ whole[frames], _gradient(whole[frames], slope, reach)
         adam.zero_grad()
-        drawn, clip = chain.render(moved, view, frames), chain.clips[view][frames]
-        picture = (chain.prior.encode(drawn) - chain.prior.encode(clip)).square().sum() / drawn.numel()
+        drawn = draw(position, deformation, view)
+        picture = (prior.encode(drawn) - prior.encode(clips[view][frames])).square().sum() / drawn.numel()
         in_time = (whole[2:] - 2 * whole[1:-1] + whole[:-2]).square().mean()
         in_space = (whole[:, :, None] - whole[:, near]).square().mean()
-        loss = picture + unit(chain) * (SMOOTH_IN_TIME * in_time + SMOOTH_IN_SPACE * in_space)
+        loss = picture + moved * (SMOOTH_IN_TIME * in_time + SMOOTH_IN_SPACE * in_space)
         loss.backward()
         adam.step()
         log.metric("picture", float(picture.detach()), step)
@@ -103,18 +107,10 @@ def shape_functions(
     return w, w[..., None] * (own - torch.einsum("pk,pki->pi", w, own)[:, None])
 
 
-def unit(chain: Chain) -> float:
+def unit(clip: Float[Tensor, "t h w 3"], prior: AbstractPrior) -> float:
     """The picture's loss of the body at rest, over all frames of one view."""
-    clip = next(iter(chain.clips.values()))
-    code = chain.prior.encode(clip) - chain.prior.encode(clip[:1].expand_as(clip))
+    code = prior.encode(clip) - prior.encode(clip[:1].expand_as(clip))
     return float(code.square().sum()) / clip.numel()
-
-
-class _Moved:
-    """What `Chain.render` draws."""
-
-    def __init__(self, *, position: Float[Tensor, "t p 3"], deformation: Float[Tensor, "t p 3 3"]):
-        self.position, self.deformation = position, deformation
 
 
 def _gradient(q: Float[Tensor, "t k 3"], slope: Float[Tensor, "p k 3"], reach: float) -> Float[Tensor, "t p 3 3"]:

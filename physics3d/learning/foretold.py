@@ -1,9 +1,11 @@
-"""Pictures of what is to come: the last frame seen, carried along by the motion of the body.
+"""Pictures of what is to come: a frame that was seen, carried along by the motion of the body.
 
-    y = x + u(t_l, x),     v(t, y) = J(x) (q(t) - q(t_l)) [px]
+    y = x + u(t_k, x),     v(t, y) = J(x) (q(t) - q(t_k)) [px]
 
-x is a pixel of the picture in which the body is where its Gaussians are, y where it is seen in the last frame, at t_l.
-The photograph keeps its sharpness, and a body that has come to rest its picture.
+x is a pixel of the picture in which the body is where its Gaussians are, y where it is seen in frame k, at t_k. Of the
+frames seen that one is taken in which, by the motion, the body is nearest to where it will be: a large swing turns and
+bends the picture of a thing as no small displacement does, moves its shadow, and does so again a period later. The
+photograph keeps its sharpness, and a body that has come to rest its last picture.
 
 A decay that is fitted to all that was seen goes on for ever; what rubs or touches something stops. So the last half
 period that was seen is asked: if there the thing moved by less than half of what the motion says, it has stopped. Of
@@ -29,28 +31,34 @@ Moving = FreeMotion | Swing  # a motion whose amplitudes are known at any time
 
 
 def foretold(
-    photograph: UInt8[Tensor, "h w 3"],
+    frames: UInt8[Tensor, "k h w 3"],
     sight: Sight,
     motion: Moving,
-    moved: Float[np.ndarray, "h w 2"],
+    flow: Float[np.ndarray, "k h w 2"],
     *,
-    last: float,
+    at: Float[np.ndarray, " k"],
     times: Float[np.ndarray, " n"],
 ) -> UInt8[Tensor, "n h w 3"]:
-    """Pictures at `times` [s] from the `photograph` at time `last`, in which the flow `moved` has taken the pixels of
-    the sight."""
+    """Pictures at `times` [s] from `frames` at the times `at`, where the `flow` has taken the pixels of the sight."""
     import cv2
 
-    back = inverse(moved)
-    y, x = np.mgrid[: back.shape[0], : back.shape[1]].astype(np.float32)
-    here, picture = motion.at(last), photograph.numpy()
+    there, places = (np.stack([motion.at(float(t)) for t in ts]) for ts in (at, times))
+    picks = [_nearest(sight, there, place) for place in places]
+    backs = {k: inverse(flow[k]) for k in set(picks)}
+    y, x = np.mgrid[: flow.shape[1], : flow.shape[2]].astype(np.float32)
 
-    def at(t: float) -> UInt8[np.ndarray, "h w 3"]:
-        u = sight.displacement(motion.at(t) - here)
-        v = cv2.remap(u, x + back[..., 0], y + back[..., 1], cv2.INTER_LINEAR)
-        return carried(picture, cv2.GaussianBlur(v, (0, 0), SMOOTH))
+    def picture(k: int, place: Float[np.ndarray, " m"]) -> UInt8[np.ndarray, "h w 3"]:
+        u = sight.displacement(place - there[k])
+        v = cv2.remap(u, x + backs[k][..., 0], y + backs[k][..., 1], cv2.INTER_LINEAR)
+        return carried(frames[k].numpy(), cv2.GaussianBlur(v, (0, 0), SMOOTH))
 
-    return torch.from_numpy(np.stack(spread(at, times.tolist())))
+    return torch.from_numpy(np.stack(spread(picture, picks, places)))
+
+
+def _nearest(sight: Sight, there: Float[np.ndarray, "k m"], place: Float[np.ndarray, " m"]) -> int:
+    """The last of those of `there` that are seen nearest to `place`."""
+    away = ((there - place) @ sight.gram * (there - place)).sum(1)
+    return len(away) - 1 - int(np.argmin(away[::-1]))
 
 
 def has_stopped(

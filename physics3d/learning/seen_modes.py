@@ -45,6 +45,11 @@ class Sight:
         return (self.jacobian @ q).astype(np.float32)[nearest] * fading
 
     @cached_property
+    def gram(self) -> Float[np.ndarray, "m m"]:
+        """Sum over the pixels that are looked at of J^T J [px^2 per m^2]."""
+        return _gram(self.jacobian.reshape(-1, self.jacobian.shape[-1]))
+
+    @cached_property
     def _spread(self) -> tuple[Int[np.ndarray, "h w"], Float[np.ndarray, "h w 1"]]:
         """(number of the pixel looked at that is nearest to each pixel, how much of its motion is left there)."""
         number = np.full(self.thing.shape, -1)

@@ -1,12 +1,19 @@
 """A field of stiffness: one factor on all moduli that varies over the body, where the clip asks for it.
 
-    m(X) = m_0 exp(theta_m) exp(sum_k w_k(X) theta_k),     w_k trilinear on a coarse grid of nodes around the body
+    m(X) = m_0 exp(theta_m) exp(sum_k w_k(X) theta_k),     within m_0/span .. m_0 span
 
-Nodes are so many along the longest side of the body, as far apart along the others, one where the body is thinner than
-half of that, and only those with matter near them. Their theta are pulled to 0, that is to one stiffness, by `stay`, as
-all of theta is.
+`trilinear`: w_k of a coarse voxel grid around the body. Nodes are so many along its longest side, as far apart along
+the others, one where the body is thinner than half of that, and only those with matter near them.
 
-More numbers always fit better. The field is taken where it explains more than its k nodes cost, by Schwarz' criterion
+`smooth`: a value per particle, alike where particles are near each other. The logarithm of the factor is a Gaussian
+process of covariance exp(-|X - Y|^2/(2 l^2)) between two places; theta are its coefficients in the eigenvectors of the
+covariance of up to LANDMARKS particles, from where it goes on to all others (Nystroem; Rasmussen and Williams 2006, ch.
+8.1). Eigenvectors of small eigenvalues, by which neighbours would differ, are left out: what is left is as many numbers
+as there are independent places.
+
+In both, theta are pulled to 0, that is to one stiffness, by `stay`, as all of theta is.
+
+More numbers always fit better. The field is taken where it explains more than its k numbers cost, by Schwarz' criterion
 (1978) with as many independent data as the residuals tell of (`sandwich.py`): n effective places times frames,
 
     n/2 ln(L_whole/L_field) > k/2 ln n
@@ -23,13 +30,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from physics3d.learning.deformation_field import spread as far_apart
 from physics3d.learning.fields import GlobalField
 from physics3d.learning.sandwich import Evidence, spread
 from physics3d.log import Log
 
 NODE = "node_"
 WIDTH = 0.7  # of a node's theta before the clip, a standard deviation: half and twice as stiff are usual
-LEAST = 0.02  # of the largest sum of weights, for a node to count
+LEAST = 0.02  # of the largest sum of weights, for a node to count; of the largest eigenvalue, for a vector
+LANDMARKS = 500  # particles of which the covariance is taken
 SCALES = ("modulus",)  # what is stiff and made larger alike: names end so
 
 
@@ -65,11 +74,15 @@ class StiffnessField:
         return torch.cat([self.whole.bound(first), nodes.clamp(-limit, limit)])
 
     def parameters(self, theta: Float[Tensor, " k"]) -> dict[str, Tensor]:
-        """Moduli are one number per particle [p]."""
+        """Moduli are one number per particle [p]; those that are learned stay within the span of their start."""
         first, nodes = self._split(theta)
         factor = (self.weights.to(theta) @ nodes).exp()
         values = self.whole.parameters(first)
-        return {name: value * factor if name.endswith(SCALES) else value for name, value in values.items()}
+        return {name: self._bounded(name, v * factor) if name.endswith(SCALES) else v for name, v in values.items()}
+
+    def _bounded(self, name: str, value: Float[Tensor, " p"]) -> Float[Tensor, " p"]:
+        start = torch.as_tensor(self.whole.start[name]).to(value)
+        return torch.minimum(torch.maximum(value, start / self.span), start * self.span)
 
     def velocity(self, theta: Float[Tensor, " k"]) -> Float[Tensor, " 3"]:
         return self.whole.velocity(self._split(theta)[0])
@@ -93,6 +106,18 @@ def trilinear(X: Float[Tensor, "p 3"], nodes: int) -> Float[Tensor, "p k"]:
     held = weights.sum(0)
     weights = weights[:, held > LEAST * held.max()]
     return weights / weights.sum(1, keepdim=True)
+
+
+def smooth(X: Float[Tensor, "p 3"], length: float) -> Float[Tensor, "p k"]:
+    """Weights of the eigenvectors of the covariance of that `length` [m] that count: independent theta of deviation 1
+    give a field whose deviation is 1 everywhere, and that is alike within the length."""
+    X = X.double()
+    chosen, _ = far_apart(X, LANDMARKS)
+    covariance = lambda a, b: (-torch.cdist(a, b).square() / (2 * length**2)).exp()
+    value, vector = torch.linalg.eigh(covariance(chosen, chosen))
+    counts = value > LEAST * value.max()
+    weights = covariance(X, chosen) @ (vector[:, counts] / value[counts].sqrt())
+    return weights / weights.norm(dim=1, keepdim=True)  # what was left out is shared out
 
 
 def asked_for(losses: tuple[float, float], field: StiffnessField, evidence: Evidence, log: Log) -> bool:

@@ -1,5 +1,6 @@
 """A take whose cause nobody knows: what its camera sees of the body, and the material that makes it swing so."""
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -7,7 +8,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from physics3d.filling.body import Body
+from physics3d.gaussians.cameras import Camera
 from physics3d.gaussians.model import Gaussians
+from physics3d.gaussians.register import register
 from physics3d.learning.free_body import estimate, reduced
 from physics3d.learning.free_interval import free_intervals, free_posterior
 from physics3d.learning.free_motion import FreeMotion, Material, Reduced, fit
@@ -18,11 +21,12 @@ from physics3d.modes.model import Model
 from physics3d.motion.decay import Decay, fit_decay
 from physics3d.motion.release import free_decay
 from physics3d.motion.shapes import moving, shapes
+from physics3d.motion.thing import standing
 from physics3d.scenes.base import Capture, Take
 from physics3d.world import Estimate, World
 
 SHAPES = 3  # of the flow, that the clip's frequencies are read off
-LEAST = 12  # frames that a motion is learned from
+LEAST, PERIODS = 12, 1.5  # frames, and of the largest oscillation, that a motion is learned from
 BESIDE = 0.05  # of what moves; flow runs over outlines, so that of a thin thing most is beside it
 
 
@@ -48,7 +52,7 @@ def swung(world: World, capture: Capture, gaussians: Gaussians, body: Body, *, z
     assert take is not None and take.posed is not None
     if frames_seen(take) < LEAST:
         raise ValueError(f"take {take.name}: {frames_seen(take)} frames are seen; a motion needs at least {LEAST}")
-    camera = take.cameras[0]
+    camera = found_by(capture, take, gaussians, log)
     centre = body.position.double().mean(0, keepdim=True)
     scale = float(camera.fx / camera.project(centre)[1])
     small, model = reduced(world, body, zones=zones, scale=scale, log=log)
@@ -61,11 +65,26 @@ def swung(world: World, capture: Capture, gaussians: Gaussians, body: Body, *, z
     )
 
 
-def by_its_own_camera(body: Swung, take: Take, gaussians: Gaussians, rides: Body) -> Swung:
+def by_its_own_camera(body: Swung, capture: Capture, take: Take, gaussians: Gaussians, rides: Body, log: Log) -> Swung:
     """Another take, whose camera and picture of the thing at rest are its own."""
     assert take.posed is not None
-    seen = sight(gaussians, rides, take.cameras[0], body.model.values)
+    seen = sight(gaussians, rides, found_by(capture, take, gaussians, log), body.model.values)
     return replace(body, sight=seen, picture=take.videos[0][take.posed], take=take)
+
+
+def found_by(capture: Capture, take: Take, gaussians: Gaussians, log: Log) -> Camera:
+    """The camera of a take, refined by what stands still in it where photographs show that too. Structure from motion
+    places a clip by one frame, in which the thing moves and its surroundings are few: some pixels are left."""
+    assert take.posed is not None
+    camera, picture = take.cameras[0], take.videos[0][take.posed]
+    if not take.at_rest or capture.single_object:
+        return camera
+    found = register(gaussians, camera, picture, standing(take.videos[0], picture), background=capture.background)
+    log.info(
+        f"{take.name}: its camera is refined by what stands still: what is in the middle of the picture moves by "
+        f"{found.moved:.1f} px, and pictures differ by {found.after:.3f} of the colours, {found.before:.3f} before"
+    )
+    return found.camera
 
 
 def first_take(
@@ -87,8 +106,9 @@ def first_take(
     weight = np.ones(u.shape[:3], np.float32)
     signal = shapes(u, weight, where, count=SHAPES).signal
     decay, release = free_decay(signal, body.take.fps)
-    if release < body.take.release <= len(frames) - LEAST:
-        release = body.take.release  # known from elsewhere, a person or the whole clip
+    later = min(body.take.release, _latest(decay, len(frames), body.take.fps))
+    if release < later:
+        release = later  # known from elsewhere, a person or the whole clip
         decay = fit_decay(signal, body.take.fps, first=release)
     if decay.main() is None:
         raise ValueError(
@@ -96,6 +116,14 @@ def first_take(
         )
     log.info(f"free from frame {release} on; largest oscillation {decay.frequency[decay.main()]:.3g} Hz")
     return clip, u, trusted, decay, release
+
+
+def _latest(decay: Decay, count: int, fps: float) -> int:
+    """The last of `count` frames from which enough of the largest oscillation is seen. A whole clip says late where its
+    decay is that of modes to the last hundredth, which no wide swing is: of a short clip little would be left."""
+    main = decay.main()
+    least = LEAST if main is None else max(LEAST, math.ceil(PERIODS * fps / decay.frequency[main]))
+    return count - least
 
 
 def learned_free(

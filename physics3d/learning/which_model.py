@@ -29,6 +29,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from physics3d.boundaries.base import AbstractBoundary
+from physics3d.boundaries.impulse import Impulse
 from physics3d.learning.course import Point
 from physics3d.learning.fields import GlobalField, physical
 from physics3d.learning.likelihood import Ratio, ratios
@@ -39,6 +41,8 @@ from physics3d.learning.polish import polish
 from physics3d.log import Log
 from physics3d.priors.base import draws
 
+LONGER = 3.0  # than the clip, is what could be filmed next
+PULL = 1 / 3  # of the force of a push, that pulls steadily
 LITTLE = 1e-3  # of a part that is left out
 TIE = math.log(20.0)  # ln B up to which a simpler model is not excluded
 
@@ -220,3 +224,31 @@ def rise(
             A, b, c = A + w * J.T @ J, b + w * J.T @ apart, c + w * float(apart @ apart)
             pixels += videos[0].numel()
     return max(0.5 * (c - b @ np.linalg.pinv(JJ * pixels + A, hermitian=True) @ b) / pixels, 0.0)
+
+
+def recordings(
+    excitation: tuple[AbstractBoundary, ...], seconds: float
+) -> dict[str, tuple[tuple[AbstractBoundary, ...], float]]:
+    """What a person could film next of a thing that was filmed for so long [s], in words -> (what sets it going, how
+    many times as long it is filmed)."""
+    long = LONGER * seconds
+    found: dict[str, tuple[tuple[AbstractBoundary, ...], float]] = {
+        f"the same again, filmed for {long:.2g} s": (excitation, LONGER)
+    }
+    pushes = [b for b in excitation if isinstance(b, Impulse) and b.force is not None and any(map(float, b.force))]
+    if len(pushes) != 1:  # several together have no side
+        return found
+    push = pushes[0]
+    assert push.force is not None
+    x, y, z = map(float, push.force)
+    other = lambda **change: tuple(replace(b, **change) if b is push else b for b in excitation)
+    found["a push as strong, from another side"] = (
+        other(force=(-y, x, z) if math.hypot(x, y) > abs(z) else (z, x, y)),
+        1,
+    )
+    weight = PULL * math.hypot(x, y, z)
+    found[f"a steady pull of {weight:.2g} N where it was pushed, as by a weight on a thread, for {long:.2g} s"] = (
+        other(force=(PULL * x, PULL * y, PULL * z), duration=long),
+        LONGER,
+    )
+    return found

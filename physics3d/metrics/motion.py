@@ -42,7 +42,7 @@ def motion_psnr(video: UInt8[Tensor, "t h w 3"], reference: UInt8[Tensor, "t h w
     first = reference[0].cpu().numpy()
 
     def summed(a: np.ndarray, b: np.ndarray) -> tuple[float, int]:
-        moved = (cv2.absdiff(b, first) > CHANGE * 255).any(-1).astype(np.uint8)
+        moved = np.asarray((cv2.absdiff(b, first) > CHANGE * 255).any(-1), np.uint8)
         return cv2.norm(a, b, cv2.NORM_L2SQR, mask=moved) / 255**2, 3 * int(moved.sum())
 
     totals, counts = zip(*per_frame(video, reference, summed))

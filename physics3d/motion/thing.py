@@ -11,6 +11,7 @@ pieces that are found, the one that holds most of what moves is the thing.
 """
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
@@ -18,10 +19,21 @@ from physics3d.motion.flow import flow, trust
 from physics3d.motion.usable import inside
 
 STILL, MOVES = 0.02, 0.05  # of the largest size
+LOW_PASS, CHANGED = 0.8, 8.0  # [px], grey levels
 ROUNDS = 8  # of GrabCut
 LEAST = 64  # pixels that make a thing
 
 Box = tuple[float, float, float, float]
+
+
+def standing(frames: UInt8[Tensor, "t h w 3"], picture: UInt8[Tensor, "h w 3"]) -> Bool[Tensor, "h w"]:
+    """Pixels whose colour, after a low-pass, is in no frame another than in the picture."""
+    import cv2
+
+    soft = lambda frame: cv2.GaussianBlur(frame.numpy().astype(np.float32), (0, 0), LOW_PASS)
+    there = soft(picture)
+    change = np.maximum.reduce([np.abs(soft(frame) - there).max(-1) for frame in frames])
+    return torch.from_numpy(change < max(3 * float(np.median(change)), CHANGED))
 
 
 def moving_thing(
@@ -40,9 +52,9 @@ def moving_thing(
     size = np.sqrt((weight * (u**2).sum(-1)).sum(0) / weight.sum(0))
     allowed = np.ones(size.shape, bool) if box is None else inside(box, *size.shape)
     size = size / max(float(np.percentile(size, 99.5)), 1e-6)
-    soft = np.stack([cv2.GaussianBlur(frame.astype(np.float32), (0, 0), 0.8) for frame in frames.numpy()])
+    soft = np.stack([cv2.GaussianBlur(frame.astype(np.float32), (0, 0), LOW_PASS) for frame in frames.numpy()])
     change = np.sqrt(((soft - soft[at]) ** 2).mean(-1)).max(0)
-    changed = cv2.dilate((change > max(3 * float(np.median(change)), 8)).astype(np.uint8), np.ones((3, 3))) > 0
+    changed = cv2.dilate((change > max(3 * float(np.median(change)), CHANGED)).astype(np.uint8), np.ones((3, 3))) > 0
     label = np.full(size.shape, cv2.GC_BGD, np.uint8)
     label[allowed & (size > STILL)] = cv2.GC_PR_BGD
     likely = allowed & (size > MOVES) & changed

@@ -4,6 +4,7 @@ import pytest
 import torch
 from small_scene import ELASTIC, bar, bar_chain, capture, world
 
+from physics3d.learning.chain import filmed
 from physics3d.learning.deformation_field import fit_field, shape_functions, spread
 from physics3d.learning.fields import GlobalField
 from physics3d.log import Log
@@ -41,7 +42,10 @@ def test_a_filmed_motion_is_found_without_physics_and_only_where_it_was_filmed()
     chain = bar_chain(world(ELASTIC), field, clip, 6)
     with torch.no_grad():
         truth = chain.simulate(field.zero())
-    found = fit_field(chain, bar()[1], fps=20.0, nodes=12, steps=80, learning_rate=0.05, log=Log(None))
+    gaussians, body = bar()
+    clips, draw = filmed(clip, gaussians, body, clip.takes[0], torch.arange(6), image_scale=1.0, device="cpu")
+    options = dict(prior=chain.prior, fps=20.0, nodes=12, steps=80, learning_rate=0.05)
+    found = fit_field(clips, draw, body, **options, log=Log(None))
     moved, true = (m.position - m.position[0] for m in (found, truth))
     top = bar()[1].position[:, 2] > 0.3
     assert float(true[-1, top, 0].abs().mean()) > 0.01, "or there is nothing to find"

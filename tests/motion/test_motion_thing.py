@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy import ndimage
 
-from physics3d.motion.thing import moving_thing
+from physics3d.motion.thing import moving_thing, standing
 
 
 def swinging(rng, *, h=120, w=160, frames=24, colour=(200.0, 70.0, 60.0)):
@@ -26,6 +26,14 @@ def swinging(rng, *, h=120, w=160, frames=24, colour=(200.0, 70.0, 60.0)):
         mask = inside
     noisy = np.stack(clip) + rng.standard_normal((frames, h, w, 3))
     return torch.from_numpy(noisy.clip(0, 255).astype(np.uint8)), mask
+
+
+def test_what_stands_still_is_told_from_where_the_thing_has_been(rng):
+    clip, mask = swinging(rng)
+    still = standing(clip, clip[-1]).numpy()
+    y = np.arange(mask.shape[0])[:, None] + 0.5
+    assert still[:, :20].mean() > 0.99  # the wall, far from the thing
+    assert still[mask & (y < 60)].mean() < 0.2  # its disc
 
 
 @pytest.mark.parametrize("colour", [(200.0, 70.0, 60.0), (210.0, 200.0, 120.0)])

@@ -11,6 +11,7 @@ from physics3d.filling.body import Body
 from physics3d.gaussians.cameras import Camera, look_at
 from physics3d.gaussians.model import Gaussians
 from physics3d.log import Log
+from physics3d.metrics.image import likeness
 from physics3d.metrics.scores import Scores
 from physics3d.metrics.take_page import take_page
 from physics3d.scenes.base import Capture
@@ -116,8 +117,10 @@ class Predict:
             seen, video = 15, take.videos[0]
             clips = {name: video[seen - 1].expand(15, -1, -1, -1) for name in ("modes as seen", "image modes")}
             rows = {name: {"psnr": 10.125 + k, "frequency": None} for name in clips}
+            like = {name: likeness(clip, video[seen:]) for name, clip in clips.items()}
+            lines = {name: {"PSNR [dB]": each.psnr_per_frame, "SSIM": each.ssim} for name, each in like.items()}
             take_page(
-                take.name, video, take.fps, clips, rows,
+                take.name, video, take.fps, clips, rows, lines,
                 seen=seen, said=["it swings"], best="modes as seen", bar="image modes", log=log,
             )  # fmt: skip
             values |= {f"{take.name}: {name}": row for name, row in rows.items()}

@@ -1,14 +1,19 @@
-"""The page that compares methods, and what its command refuses."""
+"""The page that compares methods, its rows, and what its command refuses."""
 
 import csv
 import math
+from pathlib import Path
 
 import pytest
 import torch
 from PIL import Image
 
-from pipeline.compare import main
-from pipeline.compare_page import FILMED, METRICS, Row, better, ties, write
+from physics3d.metrics.image import psnr
+from pipeline.compare import deformed, main, of_variant
+from pipeline.compare_page import FIELD, FILMED, FROZEN, Row, better, overall, ties, write
+from pipeline.flow import first, plan
+from pipeline.stage import load, run
+from pipeline.sweep import Variant, asked
 
 ROWS = [
     Row(scene="cake", method="filmed", scores={}, video=torch.zeros((9, 12, 16, 3), dtype=torch.uint8)),
@@ -26,21 +31,77 @@ ROWS = [
 
 
 def test_every_number_is_on_the_page_and_the_best_is_bold(tmp_path):
-    write(tmp_path, ROWS, {("hat", "physics3d"): "capture: no photographs"}, {"seed": 7})
+    lost = {
+        ("hat", "physics3d"): "capture: no photographs",
+        ("cake", "physgaussian"): "render: nothing (traceback: /x/y.txt)",
+    }
+    write(tmp_path, ROWS, lost, {"seed": 7, "device": "cpu"}, words=["profile=smoke", "output=/x", "learn.steps=3"])
     text = (tmp_path / "compare.md").read_text()
-    rows = {line.split("|")[1].strip(): line for line in text.splitlines() if line.startswith("| ")}
+    cake = text[text.index("## cake") : text.index("## hat")]
+    rows = {line.split("|")[1].strip(): line for line in cake.splitlines() if line.startswith("| ")}
     assert "filmed" not in rows, "what was filmed has no score"
     assert "**30**" in rows["physics3d"] and "**0.25**" in rows["physics3d"] and "| 100 |" in rows["physics3d"]
     assert "**" not in rows["frozen first frame"] and "| 25 |" in rows["frozen first frame"]
-    assert {line.count("|") for line in rows.values()} == {len(METRICS) + 3}
-    assert "seed 7" in text and "1e5 (between 8e4 and 1.2e5)" in text
-    assert "hat, physics3d: not done, capture: no photographs" in text
+    assert {line.count("|") for line in rows.values()} == {2 + 3}, "two measures are known of any method"
+    assert list(rows) == ["method", "frozen first frame", "without_filling", "physics3d", "physgaussian"]
+    assert "| not done: render: nothing |" in rows["physgaussian"]
+    assert "| physics3d | not done: capture: no photographs |" in text[text.index("## hat") :]
+    assert '`make compare SCENES=cake,hat PROFILE=smoke ARGS="learn.steps=3"`, seed 7' in text
+    assert "1e5 (between 8e4 and 1.2e5)" in text
     table = list(csv.DictReader((tmp_path / "compare.csv").open()))
     assert [float(row["psnr"] or math.nan) for row in table[1:]] == [25.0, 30.0, 28.0]
     # a line of six pictures for what was filmed, and one for the method that has a video
     with Image.open(tmp_path / "compare_cake.jpg") as picture:
         assert picture.width > 2 * picture.height
     assert (tmp_path / "compare.png").stat().st_size > 1000
+
+
+def test_means_are_of_the_scenes_on_which_every_method_ended():
+    """Of cake and hat one mean, 25; of the cup, where one failed, none: the other's 40 would count for it alone."""
+    psnr = {("cake", "a"): 20.0, ("cake", "b"): 22.0, ("hat", "a"): 30.0, ("hat", "b"): 26.0, ("cup", "a"): 40.0}
+    names = {"a": "physgaussian", "b": "physics3d"}
+    rows = [Row(scene=scene, method=names[m], scores={"psnr": value}) for (scene, m), value in psnr.items()]
+    rows.append(Row(scene="cup", method="image modes", scores={"psnr": 41.0}))  # of real takes alone
+    table = overall(rows, {("cup", "physics3d"): "learn: nothing"}, ["cake", "hat", "cup"])
+    assert "2 of 3 scenes" in table[0]
+    assert "| physgaussian | 20 | **30** | 40 | **25** |" in table
+    assert "| physics3d | **22** | 26 | not done | 24 |" in table
+    assert "| image modes |  |  | **41** |  |" in table
+
+
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory) -> Variant:
+    """The ball by the whole method, every step filed, as a run leaves it."""
+    words = ["profile=smoke", "device=cpu", f"output={tmp_path_factory.mktemp('ball')}"]
+    words += ["learn.search=0", "learn.polish=0", "learn.steps=0", "learn.image_scale=0.5"]
+    words += ["scene.source.frames=6", "simulate.frames=6", "learn.frames=6"]
+    _, (variant,) = asked(["scenes=ball", "methods=physics3d", "runner=thread", *words])
+    capture = first(variant.config, Path(variant.config["output"]) / "artifacts")
+    run(capture, "cpu")
+    for step in plan(variant.config, capture).steps:
+        run(step, "cpu")
+    return variant
+
+
+def test_rows_are_what_the_steps_of_a_run_filed(ball):
+    filmed, still, whole = of_variant(ball)
+    assert (filmed.method, still.method, whole.method) == (FILMED, FROZEN, "physics3d")
+    # by definition: the error of the flow in units of the motion, of a picture that does not move
+    assert still.scores["flow_error"] == pytest.approx(1.0, abs=1e-6) and still.seconds is None
+    assert whole.scores["psnr"] > still.scores["psnr"] and whole.seconds > 0
+    assert filmed.video.shape == whole.video.shape
+
+
+def test_the_deformation_field_is_fitted_once_and_plays_what_it_has_seen(ball):
+    """It knows the clip that was learned from: it draws that one better than the one of another force."""
+    (row,), (again,) = deformed(ball), deformed(ball)
+    shelf = Path(ball.config["output"]) / "artifacts"
+    assert row.method == FIELD and again.seconds == row.seconds and torch.equal(again.video, row.video)
+    assert len(list((shelf / "deform").glob("[!.]*"))) == 1
+    capture = load(first(ball.config, shelf), "cpu")
+    assert set(row.scores) == set(of_variant(ball)[-1].scores)
+    seen, unseen = (capture.take(role).videos[0][: len(row.video)] for role in ("learn", "evaluate"))
+    assert psnr(row.video, seen) > psnr(row.video, unseen)
 
 
 def clips(off: dict[str, float], frames: int = 61) -> dict[str, torch.Tensor]:

@@ -3,10 +3,11 @@
 import pytest
 import torch
 
+from physics3d.learning import which_model
 from physics3d.metrics.parameters import parameter_errors
 from physics3d.truth import truth_of
 from physics3d.world import Estimate
-from pipeline.told import Parameter
+from pipeline.told import TIE, Parameter, of_models
 
 
 @pytest.mark.parametrize(
@@ -41,3 +42,17 @@ def test_what_is_true_of_the_body_is_true_of_its_parts(name, true):
     estimate = Estimate(parameters={name: torch.tensor(3e5)}, velocity=torch.zeros(3))
     table = parameter_errors({"learned": estimate}, truth)
     assert [row["truth"] for row in table.values()] == ([] if true is None else [true])
+
+
+def test_what_a_clip_leaves_open_is_told_in_words():
+    """By the odds that the learning itself decides by; the recording that tells most comes first."""
+    assert TIE == which_model.TIE
+    odds, recordings = {"without a": TIE + 0.1, "without b": TIE - 0.1}, {"a push": 1.0, "a pull": 9.0, "again": -2.0}
+    assert [line.partition(" (")[0] for line in of_models(odds, recordings)] == [
+        "without a: does not explain the clip",
+        "without b: explains the clip as well: a tie",
+        "to film next: a pull: should settle it",
+        "to film next: a push: would hardly settle it",
+        "to film next: again: would hardly settle it",
+    ]
+    assert of_models({}, {}) == []

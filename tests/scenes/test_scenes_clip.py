@@ -1,9 +1,12 @@
 """One clip of a thing that swings, from the file to what comes next: against the motion that was drawn."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from clips import FPS, decaying, encode, swinging_rod
 
+from physics3d.learning.unknown_cause import first_take, frames_seen, swung
 from physics3d.log import Log
 from physics3d.materials.viscoelastic import Viscoelastic
 from physics3d.scenes.clip import ClipSource
@@ -61,6 +64,10 @@ def test_a_clip_alone_tells_how_the_thing_swings_next(tmp_path):
     assert mine["damping"] == pytest.approx(DAMPING, rel=0.3)
     assert reference["frequency"] == pytest.approx(FREQUENCY, rel=0.01)
     assert scores[f"rod: {IMAGE}"]["psnr"] > still["psnr"]
+    # a release that is said to be late leaves one and a half periods to be learned from
+    late = replace(capture, takes=(replace(take, release=37),))
+    *_, release = first_take(swung(world, late, capture.gaussians, body, zones=1, log=Log(None)), Log(None))
+    assert 1.5 <= (frames_seen(take) - release) * FREQUENCY / FPS < 1.6
 
 
 def test_a_clip_in_which_nothing_moves_is_refused(tmp_path):
