@@ -223,7 +223,7 @@ def rise(
             J, apart = np.stack([(code - here) / STEP for code in beside], 1), real - here
             A, b, c = A + w * J.T @ J, b + w * J.T @ apart, c + w * float(apart @ apart)
             pixels += videos[0].numel()
-    return max(0.5 * (c - b @ np.linalg.pinv(JJ * pixels + A, hermitian=True) @ b) / pixels, 0.0)
+    return max(0.5 * (c - float(b @ np.linalg.pinv(JJ * pixels + A, hermitian=True) @ b)) / pixels, 0.0)
 
 
 def recordings(
