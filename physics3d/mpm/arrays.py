@@ -163,7 +163,7 @@ class Arrays:
         if self._stamp_numpy:
             self._stamp_numpy[w][0] += 1
         else:
-            wp.launch(count_up, 1, inputs=[self.stamp[w]], device=str(self.device))
+            wp.launch(count_up, 1, inputs=[1, self.stamp[w]], device=str(self.device))
 
     def shared(self, w: int) -> dict[str, object]:
         """What kernels of worker w may ask for, whatever the states they work on."""

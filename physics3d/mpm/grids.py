@@ -9,11 +9,13 @@ from physics3d.warp_types import vector, vector4
 
 @wp.kernel(module="unique", enable_backward=False)
 def count_up(
-    # in, out
+    # in
+    more: int,  # so many
+    # out
     number: wp.array(dtype=int),  # [1]
 ):
-    """One more, where the host may not say which: in a graph, which is recorded once."""
-    number[0] = number[0] + 1
+    """So many more, where the host may not say which: in a graph, which is recorded once."""
+    number[0] = number[0] + more
 
 
 @cache

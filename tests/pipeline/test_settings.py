@@ -28,7 +28,7 @@ from pipeline.settings import CONF, GROUPS, SettingsError, choices, compose
         ("scene.dx=1e9", r"^scene\.dx is 1000000000\.0; take .* <= 10000 \[m\]"),
         ("scene.spacing=5", r"^scene\.spacing is 5; take at most a cell, world\.dx = 0\.012 m"),
         ("material.start.poissons_ratio=0.5", r"^material\.start\.poissons_ratio is 0\.5; take .* < 0\.5"),
-        ("learn.frames=500", r"^learn\.frames is 500; take at most the 30 of a take"),
+        ("learn.frames=500", r"^learn\.frames is 500; take at most the 60 of a take"),
         # a name that does not exist
         ("fill.isolated=burn", r"fill\.isolated is 'burn'; take one of attach, drop, keep"),
         ("learn.learn=[youngs_modolus]", r"learn\.learn names 'youngs_modolus'; take some of youngs_modulus"),
