@@ -13,6 +13,7 @@ from machine import machine
 from pipeline.flow import up_to_date
 from pipeline.settings import compose
 from pipeline.stage import manifest
+from pipeline.told import models
 
 RESULTS = Path(__file__).resolve().parent.parent / "docs" / "results"
 PICTURES = {
