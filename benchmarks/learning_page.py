@@ -131,7 +131,7 @@ def bars(runs: list[Row], failed: list[Row]) -> list[tuple[str, str, str, str]]:
         found.append((f"mean of abs(log10 E/truth), {what}, {len(off)} runs", f"{mean:.3f}", bar, holds_))
     told = [abs(math.log10(float(row["density"]))) for row in runs if int(row["cameras"]) >= 3]
     given = f"{np.mean(told):.3f}" if told else ""
-    found.append(("of that, the density as given would bring", given, "", ""))
+    found.append(("mean of abs(log10 of density as given/truth), the same runs", given, "", ""))
     hits, total = covered(runs, ("tau",))
     found.append(("relaxation time inside its interval", f"{hits} of {total}", "all", said(0 < total == hits)))
     better = sum(float(row["psnr"]) > float(row["still"]) for row in runs)
