@@ -313,8 +313,8 @@ class Learn:
         against: dict[int, Ratio] = {}
 
         def told_apart(points: list[Point]) -> list[bool]:
-            places = [torch.cat([point.theta, theta.new_zeros(len(theta) - len(point.theta))]) for point in points]
-            found = ratios(chain, theta, places, seed=self.seed)
+            padded = lambda at: torch.cat([at, theta.new_zeros(len(theta) - len(at))])
+            found = ratios(chain, theta, [(padded(point.theta), point.loss) for point in points], seed=self.seed)
             against.update((id(point), one) for point, one in zip(points, found))
             return [one.told_apart for one in found]
 

@@ -71,14 +71,14 @@ def ratio(evidence: Evidence, rise: float, loss: float) -> Ratio:
     )
 
 
-def ratios(chain: Chain, theta: Tensor, others: Sequence[Tensor], *, seed: int) -> list[Ratio]:
-    """Of the chain at theta to each of the others: one motion for each and one more."""
+def ratios(chain: Chain, theta: Tensor, others: Sequence[tuple[Tensor, float]], *, seed: int) -> list[Ratio]:
+    """Of the chain at theta to each of the others, whose losses L are given: one motion for each and two more."""
     if not others:
         return []
     pixels = sum(clip.numel() for clip in chain.clips.values())
     here = chain.measure(theta, seed)
-    losses = [chain.measure(other, seed) for other in others]
-    evidence = apart(chain, theta, others, seed=seed)
+    evidence = apart(chain, theta, [other for other, _ in others], seed=seed)
     return [
-        ratio(one, rise=pixels * (loss - here), loss=pixels * here) for one, loss in zip(evidence, losses, strict=True)
+        ratio(one, rise=pixels * (loss - here), loss=pixels * here)
+        for one, (_, loss) in zip(evidence, others, strict=True)
     ]

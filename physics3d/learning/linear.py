@@ -126,11 +126,14 @@ def _apart(chain: Chain, theta: Tensor, others: Sequence[Tensor], seed: int) -> 
     square = np.zeros(len(others))
     scores: list[list[np.ndarray]] = [[] for _ in others]
     shares: list[list[np.ndarray]] = [[] for _ in others]
-    for i, motion in enumerate(motions[1:]):  # one at a time: videos are large
-        for seen in _around(chain, [motions[0], motion], seed, 1.0):
-            square[i] += seen.weight * float((seen.J**2).sum())
-            change = (seen.videos[1] - seen.videos[0]).double().cpu().numpy()
-            score, share = _in_blocks(_gradient(chain, seen), [change])
+    for view in chain.clips:
+        first, code, r, w = _asked(chain, motions[0], view, seed)
+        g = _gradient(chain, _Seen(videos=[first], J=torch.zeros(len(r), 0), r=r, weight=w))
+        for i, motion in enumerate(motions[1:]):  # one at a time: videos are large
+            with torch.no_grad():
+                video = chain.render(motion, view, chain.frames)
+                square[i] += w * float((chain.prior.encode(video) - code).double().square().sum())
+            score, share = _in_blocks(g, [(video - first).double().cpu().numpy()])
             scores[i].append(score)
             shares[i].append(share)
     return [
@@ -148,16 +151,24 @@ def _motions(chain: Chain, theta: Tensor, step: float) -> list[Any]:
 
 def _around(chain: Chain, motions: list[Any], seed: int, step: float) -> Iterator[_Seen]:
     """Every view of them."""
-    assert chain.certain, "a diffusion model's answers are no residuals"
     for view in chain.clips:
+        first, code, r, weight = _asked(chain, motions[0], view, seed)
         with torch.no_grad():
-            videos = [chain.render(motion, view, chain.frames) for motion in motions]
-            codes = [chain.prior.encode(video) for video in videos]
-            draw = draws(chain.prior, codes[0], torch.Generator().manual_seed(seed), levels=1)[0]
-            estimate = chain.prior.estimate(codes[0], draw, chain.condition(view, chain.frames))
-            J = torch.stack([(code - codes[0]).flatten() / step for code in codes[1:]], 1).double().cpu()
-            r = (codes[0] - estimate).flatten().double().cpu()
-        yield _Seen(videos=videos, J=J, r=r, weight=chain.prior.weight(draw.level))
+            videos = [chain.render(motion, view, chain.frames) for motion in motions[1:]]
+            changes = [(chain.prior.encode(video) - code).flatten() / step for video in videos]
+        J = torch.stack(changes, 1).double().cpu()
+        yield _Seen(videos=[first, *videos], J=J, r=r, weight=weight)
+
+
+def _asked(chain: Chain, motion: Any, view: int, seed: int) -> tuple[Tensor, Tensor, Tensor, float]:
+    """(video [t, h, w, 3], its code, r, w) of one view of a motion."""
+    assert chain.certain, "a diffusion model's answers are no residuals"
+    with torch.no_grad():
+        video = chain.render(motion, view, chain.frames)
+        code = chain.prior.encode(video)
+        draw = draws(chain.prior, code, torch.Generator().manual_seed(seed), levels=1)[0]
+        estimate = chain.prior.estimate(code, draw, chain.condition(view, chain.frames))
+        return video, code, (code - estimate).flatten().double().cpu(), chain.prior.weight(draw.level)
 
 
 def _gradient(chain: Chain, seen: _Seen) -> Float[np.ndarray, "t h w 3"]:

@@ -20,7 +20,7 @@ from physics3d.learning.interval import Posterior
 from physics3d.learning.sandwich import NORMAL
 from physics3d.log import Log
 
-FAR = 10.0  # times the loss of the answer: worse by so much that nobody looks
+FAR = 4.0  # times the loss of the answer: worse by so much that nobody looks
 
 
 def rivals(course: Sequence[Point], told_apart: Callable[[list[Point]], list[bool]]) -> list[Point]:

@@ -142,8 +142,9 @@ def compared(
     for model in simpler(field, theta, omega):
         log.info(f"the same clip {model.name}")
         own = within(chain, model)
-        found, _ = polish(own, model.field, model.field.zero(), steps=steps, stay=stay, seed=seed, log=log)
-        (one,) = ratios(chain, theta, [model.whole(found)], seed=seed)
+        found, course = polish(own, model.field, model.field.zero(), steps=steps, stay=stay, seed=seed, log=log)
+        loss = course[-1].loss if course else own.measure(found, seed)
+        (one,) = ratios(chain, theta, [(model.whole(found), loss)], seed=seed)
         verdict = Verdict(model=model, theta=found, ratio=one)
         numbers = ", ".join(f"{name} {value:.4g}" for name, value in physical(model.field, found).items())
         log.info(f"{model.name}: {verdict.words} (ln B {verdict.odds:+.1f}; {numbers})")
