@@ -5,8 +5,8 @@ few frames has a valley for every number of swings that fits between them, and w
 none of them is deep. What the clip does not tell from the answer (`likelihood.py`) is a rival. One outside the local
 interval is another valley; it stands for all that is nearer to it than to what else was tried, and intervals reach as
 far as that. One in which a polish ended (`mirror.py`) is a valley as wide as that of the answer. (A search whose steps
-skip whole valleys may have skipped the best: where swings are aliased 90 % hold 75 % of the truths, and without rivals
-3 %.)
+skip whole valleys may have skipped the best: where swings are aliased 90 % hold 84 of 100 truths, and without rivals
+three.)
 """
 
 from collections.abc import Callable, Sequence

@@ -8,10 +8,9 @@ does, with S and D of `mirror.py`,
     without the elastic branch   x' = S/D,  m' = S (1 + x'^2)/x'^2,  tau' = x'/w
 
 what is left out being LITTLE of what it was. How much the clip speaks for the whole against each is ln B of
-`likelihood.py`; B of less than 20 is a tie (Kass and Raftery 1995):
-a part that nothing asks for may be there all the same. Where one is left, recordings that a
-person could make next are computed for both. What moves apart, less what the simpler one can make good without leaving
-the first clip,
+`likelihood.py`; B of less than 20 is a tie (Kass and Raftery 1995): a part that nothing asks for may be there all the
+same. Where one is left, recordings that a person could make next are computed for both. What moves apart, less what the
+simpler one can make good without leaving the first clip,
 
     N rise = min over d of 1/2 d^T A d + 1/2 |z - z_simpler - J d|^2
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from skfem import MeshTet
 
 from physics3d.boundaries.fixed_region import FixedRegion
@@ -136,6 +137,18 @@ def test_a_seed_paints_and_scatters_petals_and_leaves_the_motion():
     kept = reference_motion.path_of("carnation")
     asked = dict(frames=twin.frames, fps=twin.fps)
     assert reference_motion.recorded(kept, twin.world(), twin.pokes(), twin.solids(), **asked) is not None
+
+
+def test_points_that_are_kept_are_some_of_the_body_and_reach_all_of_it():
+    """Of a cube: as many as may be, all of them points of it, no two of them as near as neighbours were, none far."""
+    cube = np.random.default_rng(0).uniform(0, 1, (3 * reference_motion.MOST, 3)).astype(np.float32)
+    kept = reference_motion.evenly(cube)
+    assert len(kept) == reference_motion.MOST
+    assert {tuple(row) for row in kept.tolist()} <= {tuple(row) for row in cube.tolist()}
+    gap = reference_motion.MOST ** (-1 / 3)  # of a lattice of so many
+    tree = cKDTree(kept)
+    assert tree.query(kept, k=2)[0][:, 1].min() > 0.5 * gap and tree.query(cube)[0].max() < 1.5 * gap
+    np.testing.assert_array_equal(reference_motion.evenly(cube[:10]), cube[:10])
 
 
 def test_what_was_kept_comes_back(tmp_path):
