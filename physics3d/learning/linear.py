@@ -127,7 +127,7 @@ def _apart(chain: Chain, theta: Tensor, others: Sequence[Tensor], seed: int) -> 
     scores: list[list[np.ndarray]] = [[] for _ in others]
     shares: list[list[np.ndarray]] = [[] for _ in others]
     for view in chain.clips:
-        first, code, r, w = _asked(chain, motions[0], view, seed)
+        first, code, r, w = asked(chain, motions[0], view, seed)
         g = _gradient(chain, _Seen(videos=[first], J=torch.zeros(len(r), 0), r=r, weight=w))
         for i, motion in enumerate(motions[1:]):  # one at a time: videos are large
             with torch.no_grad():
@@ -152,7 +152,7 @@ def _motions(chain: Chain, theta: Tensor, step: float) -> list[Any]:
 def _around(chain: Chain, motions: list[Any], seed: int, step: float) -> Iterator[_Seen]:
     """Every view of them."""
     for view in chain.clips:
-        first, code, r, weight = _asked(chain, motions[0], view, seed)
+        first, code, r, weight = asked(chain, motions[0], view, seed)
         with torch.no_grad():
             videos = [chain.render(motion, view, chain.frames) for motion in motions[1:]]
             changes = [(chain.prior.encode(video) - code).flatten() / step for video in videos]
@@ -160,7 +160,7 @@ def _around(chain: Chain, motions: list[Any], seed: int, step: float) -> Iterato
         yield _Seen(videos=[first, *videos], J=J, r=r, weight=weight)
 
 
-def _asked(chain: Chain, motion: Any, view: int, seed: int) -> tuple[Tensor, Tensor, Tensor, float]:
+def asked(chain: Chain, motion: Any, view: int, seed: int) -> tuple[Tensor, Tensor, Tensor, float]:
     """(video [t, h, w, 3], its code, r, w) of one view of a motion."""
     assert chain.certain, "a diffusion model's answers are no residuals"
     with torch.no_grad():

@@ -33,12 +33,11 @@ from physics3d.boundaries.impulse import Impulse
 from physics3d.learning.course import Point
 from physics3d.learning.fields import GlobalField, physical
 from physics3d.learning.likelihood import Ratio, ratios
-from physics3d.learning.linear import STEP, linearise
+from physics3d.learning.linear import STEP, asked, linearise
 from physics3d.learning.loss import Chain
 from physics3d.learning.mirror import NAMES, slow_and_fast
 from physics3d.learning.polish import polish
 from physics3d.log import Log
-from physics3d.priors.base import draws
 
 LONGER = 3.0  # than the clip, is what could be filmed next
 PULL = 1 / 3  # of the force of a push, that pulls steadily
@@ -215,14 +214,12 @@ def rise(
     with torch.no_grad():
         motions = [simulate(theta), *(simulate(tie.model.whole(place)) for place in places)]
         for view in chain.clips:
-            videos = [chain.render(motion, view, chain.frames) for motion in motions]
-            codes = [chain.prior.encode(video) for video in videos]
-            draw = draws(chain.prior, codes[0], torch.Generator().manual_seed(seed), levels=1)[0]
-            w = chain.prior.weight(draw.level)
-            real, here, *beside = (code.flatten().double().cpu().numpy() for code in codes)
+            first, code, _, w = asked(chain, motions[0], view, seed)
+            others = [chain.prior.encode(chain.render(motion, view, chain.frames)) for motion in motions[1:]]
+            real, here, *beside = (code.flatten().double().cpu().numpy() for code in (code, *others))
             J, apart = np.stack([(code - here) / STEP for code in beside], 1), real - here
             A, b, c = A + w * J.T @ J, b + w * J.T @ apart, c + w * float(apart @ apart)
-            pixels += videos[0].numel()
+            pixels += first.numel()
     return max(0.5 * (c - float(b @ np.linalg.pinv(JJ * pixels + A, hermitian=True) @ b)) / pixels, 0.0)
 
 
