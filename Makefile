@@ -136,7 +136,7 @@ newest: ## the tests with the newest version of everything, in an environment of
 	@$(quietly) .venv-newest/bin/python -m pip install --quiet --upgrade --upgrade-strategy eager --no-build-isolation -e '.[$(extras)]'
 	@OMP_NUM_THREADS=1 .venv-newest/bin/python -m pipeline.words -m pytest -n 2 --dist loadfile
 
-bench: $(ready) bench-speed bench-renderer bench-filling bench-embedding bench-simulation bench-swaying bench-stability bench-segmentation bench-reconstruction bench-motion bench-real bench-learning bench-starts ## measurements with plots, into docs/results; one alone: make bench-<name>
+bench: $(ready) bench-speed bench-renderer bench-filling bench-embedding bench-simulation bench-swaying bench-stability bench-segmentation bench-reconstruction bench-motion bench-real bench-learning bench-robustness ## measurements with plots, into docs/results; one alone: make bench-<name>
 
 # no `make setup`: a Python with torch, Warp, numpy, scipy, matplotlib, jaxtyping and annotated-types is enough
 bench-gpu: ## simulator and renderer on a GPU, right and how fast, under 8 minutes: [DATA=<folder with lego>] [ARGS="device=cuda seed=0"]
