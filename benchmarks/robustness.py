@@ -60,7 +60,7 @@ OLD_PROCESSOR = {
     "ATEN_CPU_CAPABILITY": "default",
     "MKL_ENABLE_INSTRUCTIONS": "SSE4_2",
     "OPENBLAS_CORETYPE": "Core2",
-    "NPY_DISABLE_CPU_FEATURES": "AVX2 FMA3 AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL",
+    "NPY_DISABLE_CPU_FEATURES": "X86_V3 X86_V4 AVX512_ICL AVX512_SPR",
 }
 E, NU, TAU = "material.start.youngs_modulus", "material.start.poissons_ratio", "material.start"
 FLOWER = {"youngs_modulus": "E [Pa]", "branch_shear_modulus": "mu_N [Pa]", "shear_relaxation_time": "tau [s]"}
