@@ -32,6 +32,7 @@ from physics3d.learning.chain import chain_of
 from physics3d.learning.course import Point, history
 from physics3d.learning.curves import curves
 from physics3d.learning.fields import AXES, AbstractField, GlobalField, physical
+from physics3d.learning.film_next import film_next
 from physics3d.learning.fit import fit
 from physics3d.learning.imagined import Imagined
 from physics3d.learning.interval import Beyond, Told, intervals, is_stiff, of_branches, posterior, told, words
@@ -45,7 +46,7 @@ from physics3d.learning.search import search
 from physics3d.learning.stiffness_field import WIDTH, StiffnessField, asked_for, is_node, picture, smooth, trilinear
 from physics3d.learning.unknown_cause import learned_free
 from physics3d.learning.valley import reaches
-from physics3d.learning.which_model import compared, film_next, other_end
+from physics3d.learning.which_model import compared, other_end
 from physics3d.log import Log
 from physics3d.pictures import contact_sheet, titled, to_uint8
 from physics3d.priors.base import AbstractPrior

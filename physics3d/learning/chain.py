@@ -15,8 +15,8 @@ from physics3d.gaussians.deform import Backdrop, render_deformed
 from physics3d.gaussians.model import Gaussians
 from physics3d.journal import Journal
 from physics3d.learning.fields import AbstractField
+from physics3d.learning.film_next import recordings
 from physics3d.learning.loss import Chain
-from physics3d.learning.which_model import recordings
 from physics3d.log import Log
 from physics3d.priors.base import AbstractPrior
 from physics3d.priors.estimators.base import AbstractEstimator

@@ -11,11 +11,12 @@ from scipy.linalg import expm
 
 from physics3d.boundaries.impulse import Impulse
 from physics3d.learning.fields import GlobalField
+from physics3d.learning.film_next import film_next, recordings
 from physics3d.learning.likelihood import ratio
 from physics3d.learning.loss import Chain
 from physics3d.learning.mirror import NAMES
 from physics3d.learning.sandwich import Evidence
-from physics3d.learning.which_model import LITTLE, TIE, compared, film_next, recordings, simpler
+from physics3d.learning.which_model import LITTLE, TIE, compared, simpler
 from physics3d.log import Log
 from physics3d.priors.exemplar import Exemplar
 
