@@ -95,12 +95,18 @@ class Chain:
         """The denoising loss over all views and frames, always with the same noise."""
         return self.journal.ask("measure", theta, seed, answer=lambda: self._measured(theta, seed))
 
-    def _measured(self, theta: Tensor, seed: int) -> float:
+    def still(self, theta: Tensor, seed: int) -> float:
+        """What `measure` is of the first picture of the motion, standing still."""
+        return self.journal.ask("still", theta, seed, answer=lambda: self._measured(theta, seed, 0 * self.frames))
+
+    def _measured(self, theta: Tensor, seed: int, drawn: Tensor | None = None) -> float:
+        """`drawn`: the frames that are drawn in the place of all."""
         generator, total, pixels = torch.Generator().manual_seed(seed), 0.0, 0
         with torch.no_grad():
             motion = self.simulate(theta)
             for view in self.clips:
-                video, condition = self.render(motion, view, self.frames), self.condition(view, self.frames)
+                video = self.render(motion, view, self.frames if drawn is None else drawn)
+                condition = self.condition(view, self.frames)
                 total += denoising_loss(self.prior, video, condition, generator=generator)
                 pixels += video.numel()
         return total / pixels

@@ -3,10 +3,13 @@
 Offsets are tried along a line, equally far apart. Where the lowest loss is at an end, the line goes on from there by
 the same step, so that a start which is a factor 100 off is found as one that is a factor 2 off; it ends at the span of
 the field. Between the best and its neighbours the middles are tried as well, for of two places to either side of the
-best valley one may lie in another. A second valley that is nearly as deep is said: then the clip, as far as the search
+best valley one may lie in another. A valley is the narrower the more swings a clip shows: where the best that was tried
+explains little more than a picture that stands still, all of the line is looked at again between what was tried, once
+or twice. A second valley that is nearly as deep is said: then the clip, as far as the search
 sees, has two answers.
 """
 
+import itertools
 import math
 
 from torch import Tensor
@@ -16,6 +19,8 @@ from physics3d.learning.fields import GlobalField
 from physics3d.learning.loss import Chain
 from physics3d.log import Log
 
+DEEP = 0.75  # of the loss of a picture that stands still: below it something is explained
+FINE = 0.2  # between neighbours that are looked at, in the logarithm: a tenth of a frequency
 NEARLY = 1.5  # as deep: so many times the lowest loss, as of two answers that a descent may still exchange
 
 
@@ -44,6 +49,14 @@ def search(
         if tried[best].loss <= tried[best + side * step].loss:
             break
         best += side * step
+    still = chain.still(field.zero(), seed)
+    while tried[best].loss > DEEP * still and step > FINE:
+        log.info("nothing that was tried explains much more than a picture that stands still: looking between")
+        at = sorted(tried)
+        for low, high in log.progress(list(itertools.pairwise(at)), "finer search"):
+            measure((low + high) / 2)
+        step /= 2
+        best = min(tried, key=lambda offset: tried[offset].loss)
     others = [other for other in valleys(tried) if other != best]
     for side in (-1, 1):
         if abs(best + side * step / 2) <= limit:
