@@ -271,6 +271,7 @@ def plot(rows: list[Row]) -> Any:
                     row.seconds, row.scores["psnr"], MARKS[methods.index(row.method) // 10], color=colour
                 )
         axis.set(title=scene, xscale="log")
+        axis.xaxis.set_major_formatter(lambda value, at: f"{value:g}")
         axis.xaxis.set_minor_formatter(lambda value, at: f"{value:g}" if f"{value:.0e}"[0] in "25" else "")
     for axis in panels.flat[len(scenes) :]:
         axis.set_axis_off()
