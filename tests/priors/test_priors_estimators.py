@@ -134,6 +134,20 @@ def test_videos_are_compared_by_their_expected_denoising_error():
     assert worse == sorted(worse), "what is further from the mean is less probable"
 
 
+def test_which_of_two_videos_is_more_probable_does_not_depend_on_the_noise():
+    """By a noise and its negative what is linear in it cancels: at one level, of a linear prior, the difference of two
+    losses is that of the expected ones, exactly."""
+    mean = waving(SHAPE)
+    prior = GaussianPrior(mean=mean, sigma=(1.0, 1.0 + 1e-12))
+    one, other = mean.flip(0), mean + 0.3
+    for seed in range(3):
+        losses = [
+            denoising_loss(prior, video, None, generator=torch.Generator().manual_seed(seed)) for video in (one, other)
+        ]
+        # float64; sums of 360 squares
+        assert losses[0] - losses[1] == pytest.approx(prior.expected_loss(one) - prior.expected_loss(other), rel=1e-8)
+
+
 def test_draws_cover_every_range_of_levels_once_and_mirror_their_noise():
     prior, like = GaussianPrior(mean=waving(SHAPE), sigma=(1.0, 16.0)), waving(SHAPE)
     found = draws(prior, like, torch.Generator().manual_seed(3), levels=4, mirrored=True)
