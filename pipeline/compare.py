@@ -28,7 +28,7 @@ from pipeline.settings import SettingsError, choices
 from pipeline.shelf import using
 from pipeline.stage import StageError, Step, here, manifest, peek, run
 from pipeline.sweep import OWN, Crew, Variant, asked, swept
-from pipeline.told import Parameter, Table, parameters, scores
+from pipeline.told import Parameter, Table, models, parameters, scores
 
 GIVEN = "physgaussian"  # the method that learns nothing
 # what rows of takes of unknown cause are called in the table of methods; others keep their names
@@ -133,6 +133,7 @@ def of_variant(variant: Variant) -> list[Row]:
         scores=_numbers(table.values[name]) if name else {},
         seconds=sum(_seconds(step) for step in steps.values() if not step.name.endswith("_initial")),
         learned=_learned(variant, whole),
+        models=models(whole) if is_whole else [],
     )
     if table.step == "foretell":
         return of_takes(found, table)

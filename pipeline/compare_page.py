@@ -50,6 +50,7 @@ class Row:
     learned: dict[str, str] = field(default_factory=dict)  # parameter -> value and interval, in words
     video: Any = None  # uint8 [t, h, w, 3] of the first camera that judges
     fps: float | None = None  # of what was filmed [1/s]
+    models: list[str] = field(default_factory=list)  # which simpler ones the clip leaves open, what would settle it
 
     @property
     def name(self) -> str:
@@ -146,8 +147,9 @@ def section(scene: str, found: Compared) -> list[str]:
     # what pictures are too small for, or a thing moves too little, is no column
     measures = [m for m in METRICS if any(m in row.scores for row in table)]
     lines = ["", f"## {scene}", ""]
-    if filmed := next((row for row in found.rows if row.method == FILMED and row.fps), None):
-        lines += [f"The unseen motion is filmed for {len(filmed.video) / filmed.fps:.2g} s.", ""]
+    for row in found.rows:
+        if row.method == FILMED and row.fps is not None:
+            lines += [f"The unseen motion is filmed for {len(row.video) / row.fps:.2g} s.", ""]
     lines += ["| method | " + " | ".join(m.replace("_", " ") for m in measures) + " | s |"]
     lines += ["|---" * (len(measures) + 2) + "|"]
     best = {}
@@ -235,9 +237,10 @@ def ties(rows: list[Row]) -> list[str]:
             alike.append(row.name)
     if alike:
         lines.append(
-            f"- This clip does not tell {', '.join([best.name, *alike])} apart. What would: a recording that goes on "
-            "until the motion has died away, a second force, or a weight hung on the thing."
+            f"- This clip does not tell {', '.join([best.name, *alike])} apart. What would: sharper pictures, a "
+            "recording that goes on until the motion has died away, a second force, or a weight hung on the thing."
         )
+        lines += [f"- {row.name} itself says: {sentence}" for row in judged for sentence in row.models]
     return lines
 
 

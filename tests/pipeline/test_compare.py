@@ -2,6 +2,7 @@
 
 import csv
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -210,7 +211,9 @@ def test_ties_are_called_ties_and_say_what_would_settle_them():
         Row(scene="cake", method=name, scores={"psnr": psnr}, video=made[name])
         for name, psnr in (("shell", 20.0), ("full", 30.0), ("elastic", 29.9))
     ]
+    rows[2] = replace(rows[2], models=["to film next: a weight: should settle it (ln B +4.0)"])
     text = ties(rows)
+    assert text[3:] == ["- full itself says: to film next: a weight: should settle it (ln B +4.0)"]
     assert "above elastic" in text[0] and text[0].endswith("a tie")
     assert "above shell" in text[1] and "tie" not in text[1]
     assert "does not tell full, elastic apart" in text[2] and "second force" in text[2]
