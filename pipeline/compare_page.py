@@ -268,7 +268,8 @@ def plot(rows: list[Row]) -> Any:
                 continue
             colour = f"C{methods.index(row.method) % 10}"
             if row.seconds is None:
-                keys[row.method] = axis.axhline(row.scores["psnr"], color=colour, linestyle=":")
+                line = axis.axhline(row.scores["psnr"], color=colour, linestyle=":")
+                keys.setdefault(row.method, line)  # a point, where there is one, says more
             else:
                 (keys[row.method],) = axis.plot(
                     row.seconds, row.scores["psnr"], MARKS[methods.index(row.method) // 10], color=colour
