@@ -1,9 +1,11 @@
 """The chain theta -> motion -> video -> prior -> gradient, and the descent."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
+from gaussian_prior import GaussianPrior
 from small_scene import DAMPED, bar, bar_chain, cameras, capture, world
 
 from physics3d.gaussians.carry import carry
@@ -125,6 +127,19 @@ def test_descent_finds_the_truth_from_random_frames_and_views_and_leaves_the_uns
     assert float(field.parameters(theta)["unseen"]) == 1.0
     assert len(course) == 41 and course[-1].loss < 0.01 * course[0].loss, "every step, and the result"
     assert torch.equal(course[-1].theta, theta)
+
+
+def test_losses_of_a_prior_that_draws_noise_differ_by_the_videos_alone():
+    """What is asked between two all but equal materials changes nothing of their losses; another seed does, for it is
+    another noise."""
+    chain, field = toy()
+    noisy = replace(chain, prior=GaussianPrior(mean=chain.clips[0], deviation=0.1))
+    at = lambda more: field.zero() + torch.tensor([more, 0.0], dtype=torch.float64)
+    first, other, again = (noisy.measure(at(more), 0) for more in (0.0, 0.3, 1e-9))
+    assert abs(again - first) < 1e-6 * first
+    spread = [noisy.measure(at(0.0), seed) for seed in range(1, 9)]
+    assert max(spread) - min(spread) > 1e-3 * first
+    assert other != pytest.approx(first, rel=1e-3)
 
 
 def test_same_seed_same_path():
