@@ -129,7 +129,7 @@ def identified(body: Reduced, clip: Observed, decay: Decay, *, reference: float 
     candidates = [np.array([decay.frequency[j], max(decay.damping[j], least[j])]) for j in swings]
 
     def apart(exponent: float) -> tuple[float, tuple[np.ndarray, np.ndarray, LargeSwing]]:
-        """(cost, frequencies, dampings and law) of the oscillations with this exponent."""
+        """(what is left, frequencies, dampings and law) of the oscillations with this exponent."""
         left, poles, large, best = list(candidates), np.zeros((0, 2)), np.zeros(2), 1.0
         while left and len(poles) < MOST:
             theta = np.concatenate([large, np.zeros(2 + 2 * len(poles))])
@@ -142,10 +142,10 @@ def identified(body: Reduced, clip: Observed, decay: Decay, *, reference: float 
                 continue
             f, d, law = named(found.x, tried, exponent)
             poles, large, best = np.stack([f, d], 1), found.x[:2], found.fun
-        return best, (*poles.T, law)
+        return solved(*poles.T, law)[1], (*poles.T, law)
 
     rubs, smooth = (apart(exponent) for exponent in (1.0, 2.0))
-    worth = lambda one: one[0] / ASKED ** len(one[1][0])  # as many oscillations as asked for
+    worth = lambda one: one[0] / ASKED ** len(one[1][0])  # the wrong law is made good by more oscillations
     f, d, large = smooth[1] if worth(smooth) < TOLD * worth(rubs) else rubs[1]
     both = solved(f, d, large)[0] * np.sqrt(space)
     one = np.stack([np.linalg.svd(pair)[2][0] for pair in both]) / np.sqrt(space)
