@@ -166,6 +166,7 @@ def swinging(
     t = np.arange(len(clip.gram)) / clip.fps
     functions = time_functions(f, d, r, large, t)
     size = functions**2 @ clip.weight  # of a motion over the frames, whichever of them the flow counts from
+    size = np.maximum(size, 1e-9 * size.max())  # what creeps without swinging has no sine
     if reference is not None:
         functions = functions - time_functions(f, d, r, large, np.array([reference]))
     G = np.einsum("mk,tmn,nl->tkl", shape, clip.gram, shape, optimize=True)

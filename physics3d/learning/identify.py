@@ -8,7 +8,8 @@ Model Updating in Structural Dynamics):
     q(t) = q_0 + sum_j psi_j e^(-d_j (t + g l(t))) (a_j cos p_j(t) + b_j sin p_j(t)),     p_j(t) = 2 pi f_j (t - k l(t))
 
 f_j and d_j are those of small swings; large ones are slower, by the share k at time 0, and die out faster, by the share
-g, as a power n of the amplitude (`large_swing.py`, which has l): 1, or 2 where that leaves a tenth less. q_0 is where the thing comes to rest in a take whose picture at rest is another one's.
+g, as a power n of the amplitude (`large_swing.py`, which has l): 1, or 2 where that leaves a tenth less. q_0 is where
+the thing comes to rest in a take whose picture at rest is another one's.
 
 Amplitudes and shapes are linear least squares inside (variable projection, Golub and Pereyra 1973), as in
 `free_motion.py`; f, d, k and g are refined from what `motion/decay.py` reads off. An oscillation is taken up if it
@@ -39,7 +40,9 @@ ASKED = 0.7  # of the unexplained motion
 SEEN = 1e-4  # what FAINT is for shapes that were read off a clip
 # of what is likely: k; g, for what softens by a tenth by rubbing has about as much damping again; and, in the logarithm
 WIDTH = {"slowing": 0.1, "loss": 1.0, "frequency": 0.05, "damping": 1.0}
-TAKES = np.array([0.03, 0.3])  # what frequencies and dampings of one thing differ by from take to take, in the logarithm
+TAKES = np.array(
+    [0.03, 0.3]
+)  # what frequencies and dampings of one thing differ by from take to take, in the logarithm
 LEAST_DAMPING = 0.005  # that a refinement starts from, in 2 pi f
 LEAST_LARGE, MOST_LARGE = np.array([-0.3, -0.9]), np.array([0.3, 3.0])  # k, g
 TOLD = 0.9  # of the unexplained motion: the square of the amplitude has to leave less than the amplitude itself does
@@ -113,7 +116,7 @@ def identified(body: Reduced, clip: Observed, decay: Decay, *, reference: float 
 
     def named(theta: np.ndarray, poles: np.ndarray, exponent: float) -> tuple[np.ndarray, np.ndarray, LargeSwing]:
         f, d = poles[:, 0] * np.exp(theta[2::2]), poles[:, 1] * np.exp(theta[3::2])
-        return f, d, LargeSwing(slower=theta[0], sooner=theta[1], exponent=exponent, damping=d[0])
+        return f, d, LargeSwing(slower=float(theta[0]), sooner=float(theta[1]), exponent=exponent, damping=float(d[0]))
 
     def cost(theta: np.ndarray, poles: np.ndarray, exponent: float) -> float:
         large, by_f, by_d = theta[:2], theta[2::2], theta[3::2]

@@ -105,8 +105,8 @@ def test_a_take_that_is_damped_otherwise_says_so_as_far_as_it_is_seen(damping):
     differ by draws it to the first take, and less than half of the way."""
     body, rng = chain(zones=1), np.random.default_rng(2)
     f, shape = other_system(body)
-    drawn = lambda f, d, n: (np.exp(-d * np.arange(n) / FPS) * np.cos(2 * np.pi * f * np.arange(n) / FPS))[:, None] * (
-        0.2 * shape[:, 0]
+    drawn = lambda f, d, n: (
+        (np.exp(-d * np.arange(n) / FPS) * np.cos(2 * np.pi * f * np.arange(n) / FPS))[:, None] * (0.2 * shape[:, 0])
     )
     noisy = lambda q: q + 0.01 * q.std() * rng.standard_normal(q.shape)
     first = noisy(drawn(f[0], 1.0, 75))
@@ -120,7 +120,6 @@ def test_a_take_that_is_damped_otherwise_says_so_as_far_as_it_is_seen(damping):
 
 def test_another_take_that_tells_nothing_is_as_the_first():
     body, rng = chain(zones=1), np.random.default_rng(3)
-    f, _ = other_system(body)
     first = swung(body, np.array([0.2, 0.12]), 0.0, 75, rng)
     swing = identified(body, observed(first, first[-1]), fit_decay(first, FPS), reference=74 / FPS, log=Log(None))
     still = 0.004 * rng.standard_normal((15, len(body.mass)))
@@ -159,7 +158,7 @@ def test_what_has_come_to_rest_stays_there(phase, end):
     swing = 0.2 * np.maximum(0, 1 - t / end) * np.cos(2 * np.pi * f[0] * t / FPS + phase)
     clean = swing[:, None] * shape[:, 0]
     stopped, foretold = told_of(body, clean + 0.002 * np.abs(clean).max() * rng.standard_normal(clean.shape), 75)
-    # or its decay has died out by itself: to less than the noise, which is 0.002 of the largest place, in flow of 5 px/m
+    # or its decay has died out by itself, to less than the noise: 0.002 of the largest place, at 5 px/m
     assert (stopped and not foretold.any()) or np.abs(foretold).max() < 5 * 0.002 * np.abs(clean).max()
 
 
