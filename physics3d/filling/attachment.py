@@ -12,6 +12,7 @@ from physics3d.gaussians.model import Gaussians
 from physics3d.log import Log
 
 CONTACT = (0.6, 1.0)  # particles nearer to a static Gaussian are held by it; at most, where none is so near [spacings]
+FLAT = 1 / 3  # of its width: what is no thicker is one layer, the wall of a pot around its soil as well
 SPECK = 0.05  # static clusters of less than this share are mistakes of the segmentation and hold nothing
 
 
@@ -59,7 +60,8 @@ def within_outline(position: np.ndarray, patch: np.ndarray, spacing: float) -> n
     above the soil, or a leaf's tip that lies on it, does not raise what holds the stem."""
     centre = patch.mean(0)
     _, size, axes = np.linalg.svd(patch - centre, full_matrices=False)
-    if len(patch) < 4 or size[2] > spacing * np.sqrt(len(patch)) or size[1] < 1e-3 * size[0]:
+    thin = size[2] <= max(spacing * np.sqrt(len(patch)), FLAT * size[1])
+    if len(patch) < 4 or not thin or size[1] < 1e-3 * size[0]:
         return np.zeros(len(position), bool)
     local, all_of_them = (patch - centre) @ axes.T, (position - centre) @ axes.T
     inside = Delaunay(local[:, :2]).find_simplex(all_of_them[:, :2]) >= 0
