@@ -65,7 +65,7 @@ class Foretell:
             log.metric(f"damping_{j}", float(swing.modes.damping[j]))
         motions: dict[str, Moving] = {SEEN: swing}
         for name, material in ((LEARNED, learned), (START, before)):
-            motions[name] = start(ready.reduced, material, window, reference=reference)[0]
+            motions[name] = start(ready.reduced, material, window, reference=reference, large=swing.large)[0]
         pose = {name: None if reference is None else motion.at(reference) for name, motion in motions.items()}
         if has_stopped(ready.sight, swing, flow, trusted, fps=take.fps, release=release):
             motions[SEEN] = _stopped(swing, take, notes, log)
@@ -108,7 +108,7 @@ class Foretell:
             swing = _stopped(swing, take, notes, log)
         motions: dict[str, Moving] = {SEEN: swing}
         for name, material in materials.items():
-            motions[name] = start(ready.reduced, material, window, known=known[name])[0]
+            motions[name] = start(ready.reduced, material, window, known=known[name], large=swing.large)[0]
         return self.judged(ready, take, motions, flow, release=release, seen=seen, notes=notes, log=log)
 
     def judged(
