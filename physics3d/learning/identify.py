@@ -145,7 +145,8 @@ def identified(body: Reduced, clip: Observed, decay: Decay, *, reference: float 
                 continue
             f, d, law = named(found.x, tried, exponent)
             poles, large, best = np.stack([f, d], 1), found.x[:2], found.fun
-        return solved(*poles.T, law)[1], (*poles.T, law)
+        f, d = poles.T
+        return solved(f, d, law)[1], (f, d, law)
 
     rubs, smooth = (apart(exponent) for exponent in (1.0, 2.0))
     worth = lambda one: one[0] / ASKED ** len(one[1][0])  # the wrong law is made good by more oscillations
