@@ -81,7 +81,7 @@ run: $(ready) ## the pipeline on SCENE; what has been computed before is reused
 why: $(ready) ## which stages `make run` would compute, and what has changed; runs nothing
 	@$(with_args) -m pipeline.why $(of_run)
 
-sweep: $(ready) ## many runs at once: SCENES=carnation,ball METHODS=... SEEDS=0,1 RUNNER=thread|process|dask WORKERS=2 [ADDRESS=tcp://...]
+sweep: $(ready) ## many runs at once: SCENES=carnation,ball METHODS=... SEEDS=0,1 RUNNER=thread|process|dask|ray WORKERS=2 [ADDRESS=tcp://...]
 	@$(threads) $(with_args) -m pipeline.sweep scenes="$$SCENES" methods="$$METHODS" seeds="$$SEEDS" runner="$$RUNNER" workers="$$WORKERS" \
 		address="$$ADDRESS" profile="$$PROFILE" $${DATA:+data="$$DATA"}
 

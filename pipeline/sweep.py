@@ -83,7 +83,9 @@ class Crew:
             case "ray":
                 from prefect_ray import RayTaskRunner
 
-                return RayTaskRunner(address=self.address or None)
+                if self.address:
+                    return RayTaskRunner(address=self.address)
+                return RayTaskRunner(init_kwargs={"num_cpus": self.workers, "include_dashboard": False})
         from prefect_dask import DaskTaskRunner
 
         if self.address:

@@ -19,7 +19,7 @@ from physics3d.mpm.graphs import Graphs
 from physics3d.mpm.launches import Arguments, launch_over, record
 from physics3d.mpm.state import State
 from physics3d.mpm.substep import Launches, Substeps
-from physics3d.mpm.threads import Wait, on_all, shares
+from physics3d.mpm.threads import Wait, shares
 from physics3d.warp_types import vector, vector4
 
 _KEEP_MOMENTA = 4  # nodes per particle up to which the momenta of nodes are kept for the way back
@@ -35,7 +35,8 @@ class Adjoint:
         arrays, real = self.arrays, self.arrays.real
         vec3 = vector(real)
         self.states: list[State] = [arrays.new_state(), arrays.new_state()]
-        self._flat: list[Any] = [wp.from_torch(state.flat) for state in self.states]  # the same bytes
+        # of each worker and set, the same bytes: zero before a substep adds to them
+        self._own: list[list[list[Any]]] = [[self._parts(state, w) for state in self.states] for w in arrays.ranges]
         self.v_pushed: wp.array | None = arrays.zeros(arrays.n, vec3) if arrays.v_pushed is not None else None
         self.coefficients: wp.array = arrays.zeros((arrays.row_count, arrays.n), real)
         self.offset: wp.array = arrays.zeros(arrays.n, vec3)
@@ -57,6 +58,14 @@ class Adjoint:
         self.graphs = Graphs(arrays.device)  # of runs backwards
         self.follow_grid()
 
+    def _parts(self, state: State, own: tuple[int, int]) -> list[Any]:
+        """What a worker with the particles `own` (the first, how many) has of an adjoint state."""
+        if self.arrays.workers == 1:
+            return [wp.from_torch(state.flat)]
+        part = slice(own[0], sum(own))
+        parts = [x[part] for x in (state.u, state.v, state.L, state.tau, state.H)] + [state.memory[:, part]]
+        return parts + ([state.v_gathered[part], state.L_gathered[part]] if self.arrays.steered else [])
+
     def clear(self) -> None:
         """Zero again."""
         for array in (self.coefficients, self.offset, self.rest, self.selection, self.mass, self.volume, *self.q):
@@ -73,66 +82,90 @@ class Adjoint:
         self.follow_grid()
         momenta = None if self.momenta is None else self.momenta.numpy()
         substeps.run(clock, path, momenta)
-        steps = list(enumerate(pairwise(path)))[::-1]
-        sides = [(side + s) % 2 for s in range(len(steps))]
-        forward = [[substeps.launches(w, i, j) for _, (i, j) in steps] for w in range(arrays.workers)]
-        backward = [
-            [self._launch(w, i, j, side) for (_, (i, j)), side in zip(steps, sides)] for w in range(arrays.workers)
-        ]
+        steps, last = list(pairwise(path)), len(path) - 2
+        sides = [(side + last - s) % 2 for s in range(len(steps))]  # of each substep, that of its later state
+        forward = [[substeps.launches(w, i, j) for i, j in steps] for w in range(arrays.workers)]
+        backward = [[self._launch(w, i, j, k) for (i, j), k in zip(steps, sides)] for w in range(arrays.workers)]
         nodes = shares(arrays.node_count, arrays.workers)
+        # nodes ask particles again: what is gripped of them, what they touch, their momenta
+        asked = momenta is None or any(name in forward[0][0] for name in ("hold", "mark"))
+
+        def ask(w: int, s: int) -> None:
+            arrays.set_row(w, s)
+            substeps.hold(forward[w][s])
+            if momenta is None:
+                substeps.scatter(forward[w][s])
+            substeps.mark(w, forward[w][s])
+
+        def update(w: int, s: int, wait: Wait) -> None:
+            arrays.set_row(w, s)
+            if momenta is None:
+                substeps.update(forward[w][s], *nodes[w], wait)
+            else:
+                substeps.update_again(forward[w][s], *nodes[w], wait, momenta[s])
 
         def worker(w: int, wait: Wait) -> None:
-            for (s, _), launch, adjoint, now in zip(steps, forward[w], backward[w], sides):
+            if asked:
+                ask(w, last)
+                wait()
+            update(w, last, wait)
+            wait()
+            for s in range(last, -1, -1):
+                launch, adjoint = forward[w][s], backward[w][s]
+                for array in self._own[w][1 - sides[s]]:
+                    array.zero_()
+                if s == last or self.fours is None:  # a sum of fours leaves zero behind
+                    launch_over(adjoint["clear_private"], 0, arrays.node_count)
+                for name in ("clear_pushed", "clear_mass", "clear_volume", "advance", "steer", "gather"):
+                    if name in adjoint:
+                        adjoint[name].launch()
+                wait()
+                self._nodes_back(w, adjoint, *nodes[w], wait)
+                if s and not asked:
+                    if arrays.coupled:
+                        wait()
+                    update(w, s - 1, wait)
+                wait()
                 arrays.set_row(w, s)
-                if w == 0:
-                    self._flat[1 - now].zero_()
-                for name in ("clear_pushed", "clear_mass", "clear_volume"):
-                    if name in adjoint:
-                        adjoint[name].launch()
-                substeps.hold(launch)
-                if momenta is None:
-                    substeps.scatter(launch)
-                elif "push" in launch:
+                if momenta is not None and "push" in launch:
                     launch["push"].launch()
-                substeps.mark(w, launch)
-                launch_over(adjoint["clear_private"], 0, arrays.node_count)
-                wait()
-                if momenta is None:
-                    substeps.update(launch, *nodes[w], wait)
-                else:
-                    substeps.update_again(launch, *nodes[w], wait, momenta[s])
-                wait()
-                for name in ("advance", "steer", "gather"):
-                    if name in adjoint:
-                        adjoint[name].launch()
-                wait()
-                first, count = nodes[w]
-                if count and "total" in adjoint:
-                    launch_over(adjoint["total"], first, count)
-                if arrays.coupled:
-                    wait()
-                    # the adjoint adds to nodes of other workers: the first one does them all
-                    first, count = (0, arrays.node_count) if w == 0 else (0, 0)
-                if count:
-                    launch_over(adjoint["clear_grid"], first, count)
-                    if arrays.grips:
-                        launch_over(adjoint["clear_gripped"], 0, arrays.grips * count)
-                        launch_over(adjoint["clear_depth"], first, count)
-                        launch_over(adjoint["clear_imposed"], first, count)
-                    launch_over(adjoint["update"], first, count)
-                    if arrays.grips:
-                        launch_over(adjoint["face"], first, count)
-                wait()
                 for name in ("scatter", "push", "hold"):
                     if name in adjoint:
                         adjoint[name].launch()
+                if s and asked:
+                    ask(w, s - 1)
+                    wait()
+                    update(w, s - 1, wait)
+                    wait()
+                elif s:
+                    arrays.set_row(w, s - 1)
 
         if arrays.recorded and momenta is None:
             key = (tuple(path), side, arrays.node_count)
             self.graphs.run(key, lambda: worker(0, lambda: None))
         else:
-            on_all(arrays.workers, worker)
-        return (side + len(steps)) % 2
+            arrays.team.run(worker)
+        return 1 - sides[0]
+
+    def _nodes_back(self, w: int, adjoint: Launches, first: int, count: int, wait: Wait) -> None:
+        """From the adjoint of the velocities of nodes to that of their momenta, for `count` nodes from `first` on."""
+        arrays = self.arrays
+        if count and "total" in adjoint:
+            launch_over(adjoint["total"], first, count)
+        if arrays.coupled:
+            wait()
+            # the adjoint adds to nodes of other workers: the first one does them all
+            first, count = (0, arrays.node_count) if w == 0 else (0, 0)
+        if not count:
+            return
+        launch_over(adjoint["clear_grid"], first, count)
+        if arrays.grips:
+            launch_over(adjoint["clear_gripped"], 0, arrays.grips * count)
+            launch_over(adjoint["clear_depth"], first, count)
+            launch_over(adjoint["clear_imposed"], first, count)
+        launch_over(adjoint["update"], first, count)
+        if arrays.grips:
+            launch_over(adjoint["face"], first, count)
 
     def reverse_start(self, clock: np.ndarray, i: int, j: int, side: int) -> int:
         """The adjoint of `start`, which is done again; the set that holds the adjoint of state i."""

@@ -12,11 +12,12 @@ import numpy as np
 import torch
 import warp as wp
 
+from physics3d.mpm.columns import SPARE
 from physics3d.mpm.grids import count_up
 from physics3d.mpm.hold import least_distance
 from physics3d.mpm.hooks import FIRST_SIGNAL, Hooks
 from physics3d.mpm.state import State, make_state
-from physics3d.mpm.threads import shares
+from physics3d.mpm.threads import Team, shares
 from physics3d.warp_types import vector, vector4
 
 
@@ -88,6 +89,7 @@ class Arrays:
         self.states: list[State] = []
         # of each worker
         self.workers: int = max(1, threads) if on_cpu else 1
+        self.team: Team = Team(self.workers)
         self.ranges: list[tuple[int, int]] = shares(self.n, self.workers)  # its first particle, how many
         self.row: list[wp.array] = [self.zeros(1, wp.int32) for _ in self.ranges]  # of the clock
         self.stamp: list[wp.array] = [self.zeros(1, wp.int32) for _ in self.ranges]  # of what is touched
@@ -133,8 +135,8 @@ class Arrays:
         self.window.assign(np.array([*lowest, *size], np.int32))
         self.lowest, self.size = tuple(lowest), tuple(size)
         self.node_count = int(np.prod(size))
-        if self.node_count > self.capacity:
-            self.capacity = int(1.5 * self.node_count) + 1  # one more: see `columns`
+        if self.node_count + SPARE > self.capacity:
+            self.capacity = int(1.5 * self.node_count) + SPARE
             self.sums = self.zeros((self.workers, self.capacity), vector4(self.sums_real))
             self.grid = self.zeros(self.capacity, vector4(self.real))
             self.node_velocity = self.zeros(self.capacity, vector(self.real))

@@ -10,13 +10,16 @@ Nodes along z are neighbours in memory: a column of three. The plain form is War
 the same loop in Clang's vectors of four, for the CPU: twice as fast, because Warp's code for a vector works on single
 numbers and checks every index for its sign. A test holds them together. There `gathered` and `spread` compute weights
 and sums in double precision whatever goes in and comes out: in single precision the weights do not add up to one, and
-momenta that are added to a node lose what 1e-7 of the sum is, in every substep. An array of 3-vectors is read in fours
-here: it needs one more element than there are nodes.
+momenta that are added to a node lose what 1e-7 of the sum is, in every substep. The adjoints take a column at once, and
+what lies beside it in memory with it: arrays need `SPARE` elements more than there are nodes.
 """
 
 from functools import cache
 
 import warp as wp
+
+
+SPARE = 3  # elements of arrays on the nodes that are read, and written as they are, behind the last one
 
 
 def _vector(real, n: int) -> type:
@@ -199,46 +202,40 @@ def spread_adjoint(real, fast: bool) -> wp.Function:
             _head(real)
             + _slopes
             + _columns_of_A
+            + _whole_columns
             + """
             const V* first = (const V*)grid.data + node;
-            V mean = {}, bx = {}, by = {}, bz = {}, ex = {}, ey = {}, ez = {};
+            const C ay_all = column_of(ay, ay, ay);
+            C mean = {}, bx = {}, by = {}, power = {}, ex = {}, ey = {};  // sums over columns, node by node
             V qi = {q[0], q[1], q[2], m};
             #pragma unroll
             for (int i = 0; i < 3; ++i) {
-                V qij = qi;
+                C qij = column_of(qi, qi + az, qi + (az + az)), s = {}, sy = {}, e = {}, ey_i = {};
                 #pragma unroll
                 for (int j = 0; j < 3; ++j) {
-                    const V* column = first + (i * ny + j) * (long long)nz;
-                    V s = {}, sz = {}, e = {}, e_z = {}, qijk = qij;
-                    #pragma unroll
-                    for (int k = 0; k < 3; ++k) {
-                        const V a = column[k], power = a * qijk;
-                        s += wz[k] * a;
-                        sz += (wz[k] * (k - f[2])) * a;
-                        e += wz[k] * power;
-                        e_z += gz[k] * power;
-                        qijk += az;
-                    }
-                    const T wij = wx[i] * wy[j];
-                    mean += wij * s;
-                    bx += (wij * (i - f[0])) * s;
-                    by += (wij * (j - f[1])) * s;
-                    bz += wij * sz;
-                    ex += (gx[i] * wy[j]) * e;
-                    ey += (wx[i] * gy[j]) * e;
-                    ez += wij * e_z;
-                    qij += ay;
+                    const C a = *(const C*)(first + (i * ny + j) * (long long)nz), p = a * qij;
+                    s += wy[j] * a;
+                    sy += (wy[j] * (j - f[1])) * a;
+                    e += wy[j] * p;
+                    ey_i += gy[j] * p;
+                    qij += ay_all;
                 }
+                mean += wx[i] * s;
+                bx += (wx[i] * (i - f[0])) * s;
+                by += wx[i] * sy;
+                power += wx[i] * e;
+                ex += gx[i] * e;
+                ey += wx[i] * ey_i;
                 qi += ax;
             }
             wp::mat_t<5, 4, T> found;
-            *(V*)found.data[0] = mean;
-            *(V*)found.data[1] = bx;
-            *(V*)found.data[2] = by;
-            *(V*)found.data[3] = bz;
-            *(V*)found.data[4] = V{
-                ex[0] + ex[1] + ex[2] + ex[3], ey[0] + ey[1] + ey[2] + ey[3], ez[0] + ez[1] + ez[2] + ez[3], 0
-            };
+            *(V*)found.data[0] = sum(mean, wz[0], wz[1], wz[2]);
+            *(V*)found.data[1] = sum(bx, wz[0], wz[1], wz[2]);
+            *(V*)found.data[2] = sum(by, wz[0], wz[1], wz[2]);
+            *(V*)found.data[3] = sum(mean, wz[0] * (0 - f[2]), wz[1] * (1 - f[2]), wz[2] * (2 - f[2]));
+            const V x = sum(ex, wz[0], wz[1], wz[2]), y = sum(ey, wz[0], wz[1], wz[2]);
+            const V z = sum(power, gz[0], gz[1], gz[2]);
+            *(V*)found.data[4] = V{x[0] + x[1] + x[2] + x[3], y[0] + y[1] + y[2] + y[3], z[0] + z[1] + z[2] + z[3], 0};
             return found;
             """
         )
@@ -312,41 +309,41 @@ def gathered_adjoint(real, fast: bool) -> wp.Function:
             _head(real)
             + _slopes
             + _columns_of_A
+            + _whole_columns
             + """
             const T* first = (const T*)v.data + 3 * (size_t)node;
             V* first_out = (V*)grid.data + node;
-            V mean = {}, ex = {}, ey = {}, ez = {};
+            const C ay_all = column_of(ay, ay, ay), wz_all = {
+                wz[0], wz[0], wz[0], wz[0], wz[1], wz[1], wz[1], wz[1], wz[2], wz[2], wz[2], wz[2], 0, 0, 0, 0
+            };
+            C mean = {}, power = {}, ex = {}, ey = {};  // sums over columns, node by node
             V qi = {q[0], q[1], q[2], 0};
             #pragma unroll
             for (int i = 0; i < 3; ++i) {
-                V qij = qi;
+                C qij = column_of(qi, qi + az, qi + (az + az)), s = {}, e = {}, ey_i = {};
                 #pragma unroll
                 for (int j = 0; j < 3; ++j) {
                     const long long at = (i * ny + j) * (long long)nz;
-                    const T* column = first + 3 * at;
-                    V* column_out = first_out + at;
-                    const T wij = wx[i] * wy[j];
-                    V s = {}, e = {}, e_z = {}, qijk = qij;
-                    #pragma unroll
-                    for (int k = 0; k < 3; ++k) {
-                        const V a = *(const V*)(column + 3 * k), power = a * qijk;
-                        s += wz[k] * a;
-                        e += wz[k] * power;
-                        e_z += gz[k] * power;
-                        column_out[k] += (wij * wz[k]) * qijk;
-                        qijk += az;
-                    }
-                    mean += wij * s;
-                    ex += (gx[i] * wy[j]) * e;
-                    ey += (wx[i] * gy[j]) * e;
-                    ez += wij * e_z;
-                    qij += ay;
+                    const C three = *(const C*)(first + 3 * at);
+                    const C a = __builtin_shufflevector(three, three, 0, 1, 2, 3, 3, 4, 5, 6, 6, 7, 8, 9, 9, 9, 9, 9);
+                    const C p = a * qij;
+                    s += wy[j] * a;
+                    e += wy[j] * p;
+                    ey_i += gy[j] * p;
+                    *(C*)(first_out + at) += (wx[i] * wy[j]) * (wz_all * qij);
+                    qij += ay_all;
                 }
+                mean += wx[i] * s;
+                power += wx[i] * e;
+                ex += gx[i] * e;
+                ey += wx[i] * ey_i;
                 qi += ax;
             }
             wp::mat_t<2, 4, T> found;
-            *(V*)found.data[0] = mean;
-            *(V*)found.data[1] = V{ex[0] + ex[1] + ex[2], ey[0] + ey[1] + ey[2], ez[0] + ez[1] + ez[2], 0};
+            *(V*)found.data[0] = sum(mean, wz[0], wz[1], wz[2]);
+            const V x = sum(ex, wz[0], wz[1], wz[2]), y = sum(ey, wz[0], wz[1], wz[2]);
+            const V z = sum(power, gz[0], gz[1], gz[2]);
+            *(V*)found.data[1] = V{x[0] + x[1] + x[2], y[0] + y[1] + y[2], z[0] + z[1] + z[2], 0};
             return found;
             """
         )
@@ -428,3 +425,19 @@ _columns_of_A = """
             const V ay = {A.data[0][1], A.data[1][1], A.data[2][1], 0};
             const V az = {A.data[0][2], A.data[1][2], A.data[2][2], 0};
             """
+_whole_columns = """
+            // a column of three nodes, and room for a fourth one that is never asked for
+            typedef T C __attribute__((vector_size(16 * sizeof(T)), aligned(sizeof(T)), may_alias));
+            const auto column_of = [](const V a, const V b, const V c) -> C {
+                return __builtin_shufflevector(
+                    __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7),
+                    __builtin_shufflevector(c, c, 0, 1, 2, 3, 0, 1, 2, 3),
+                    0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15
+                );
+            };
+            const auto sum = [](const C c, const T a0, const T a1, const T a2) -> V {
+                return a0 * __builtin_shufflevector(c, c, 0, 1, 2, 3)
+                    + a1 * __builtin_shufflevector(c, c, 4, 5, 6, 7)
+                    + a2 * __builtin_shufflevector(c, c, 8, 9, 10, 11);
+            };
+"""

@@ -41,7 +41,7 @@ from physics3d.mpm.launches import Arguments, launch_over, record
 from physics3d.mpm.mark import mark
 from physics3d.mpm.push import push
 from physics3d.mpm.steer import steer
-from physics3d.mpm.threads import Wait, on_all, shares
+from physics3d.mpm.threads import Wait, shares
 from physics3d.mpm.update import update
 from physics3d.warp_types import vector4
 
@@ -115,8 +115,6 @@ class Substeps:
                 wait()
                 self.update(launch, *nodes[w], wait, None if momenta is None else momenta[s])
                 wait()
-                if s < last:
-                    launch_over(launch["clear"], 0, arrays.node_count)
                 launch["pass"].set_param_by_name("keep", int(s == last or steps[s][0] != steps[s][1]))
                 launch["pass"].set_param_by_name("onward", int(s < last))
                 launch["pass"].launch()
@@ -125,7 +123,7 @@ class Substeps:
         if arrays.recorded and momenta is None:
             self.graphs.run((tuple(path), arrays.node_count), lambda: work(0, lambda: None))
         else:
-            on_all(arrays.workers, work)
+            arrays.team.run(work)
         return sum(int(lost.numpy()[0]) for lost in arrays.lost)
 
     def look(self, clock: np.ndarray, i: int, j: int) -> None:
@@ -148,7 +146,7 @@ class Substeps:
                 if name in launch:
                     launch[name].launch()
 
-        on_all(arrays.workers, worker)
+        arrays.team.run(worker)
 
     def start(self, clock: np.ndarray, i: int, j: int) -> None:
         """State j = state i with its stress, and with imposed motion: a substep of no length, without the grid."""

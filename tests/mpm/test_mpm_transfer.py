@@ -6,6 +6,7 @@ import torch
 import warp as wp
 
 from physics3d.mpm import transfer
+from physics3d.mpm.columns import SPARE
 from physics3d.warp_start import start_warp
 from physics3d.warp_types import matrix, vector, vector4
 
@@ -52,6 +53,11 @@ def array(value, dtype):
     return wp.from_torch(value.contiguous(), dtype=dtype)
 
 
+def padded(nodes):
+    """With as much behind them as the fast forms read, whatever it is."""
+    return torch.cat([nodes, torch.full((SPARE, nodes.shape[1]), float("nan"), dtype=nodes.dtype)])
+
+
 def window():
     return wp.array(np.array(WINDOW, np.int32), dtype=wp.int32, device="cpu")
 
@@ -71,7 +77,7 @@ def scatter(p, adjoint=None, fast=False):
         wp.launch(transfer.scatter(real, wp.float64, fast), N, inputs=inputs, outputs=[grid, lost], device="cpu")
         return wp.to_torch(grid), int(lost.numpy()[0])
     offset, *found = [wp.zeros_like(value) for value in (*inputs[-5:], *inputs[5:7])]
-    inputs.append(array(adjoint, vec4))
+    inputs.append(array(padded(adjoint), vec4))
     wp.launch(transfer.scatter_adjoint(real, fast), N, inputs=inputs, outputs=[offset, *found], device="cpu")
     torch.testing.assert_close(wp.to_torch(offset), wp.to_torch(found[0]) * DX)  # x in cells is offset + u/dx
     return [wp.to_torch(value) for value in found]
@@ -83,19 +89,18 @@ def gather(p, node_velocity, adjoint=None, fast=False):
     real = wp.float64
     vec3, mat33 = vector(real), matrix(real)
     inputs = [0, DX, window(), array(p["cell"], wp.vec3i), array(p["offset"], vec3), array(p["u"], vec3)]
-    # the fast form reads one number too many, whatever it is
-    padded = torch.cat([node_velocity, torch.full((1, 3), float("nan"), dtype=torch.float64)])
-    inputs += [array(padded, vec3)]
+    inputs += [array(padded(node_velocity), vec3)]
     outputs = [wp.zeros(N, dtype=vec3, device="cpu"), wp.zeros(N, dtype=mat33, device="cpu")]
     if adjoint is None:
         wp.launch(transfer.gather(real, fast), N, inputs=inputs, outputs=outputs, device="cpu")
         return [wp.to_torch(value) for value in outputs]
     offset, found_u = [wp.zeros_like(value) for value in inputs[-3:-1]]
-    found = [found_u, wp.zeros(SIDE**3, dtype=vector4(real) if fast else vec3, device="cpu")]
+    onto = padded(torch.zeros(SIDE**3, 4 if fast else 3, dtype=torch.float64))
+    found = [found_u, array(onto, vector4(real) if fast else vec3)]
     inputs += [array(adjoint[0], vec3), array(adjoint[1], mat33)]
     wp.launch(transfer.gather_adjoint(real, fast), N, inputs=inputs, outputs=[offset, *found], device="cpu")
     torch.testing.assert_close(wp.to_torch(offset), wp.to_torch(found[0]) * DX)
-    return [wp.to_torch(value)[:, :3] for value in found]
+    return [wp.to_torch(found[0]), wp.to_torch(found[1])[: SIDE**3, :3]]
 
 
 @pytest.mark.parametrize("fast", [False, True])

@@ -8,6 +8,7 @@ import threading
 import time
 from collections import Counter
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,8 @@ from toy import ALL, configuration
 from pipeline.settings import SettingsError
 from pipeline.stage import read_manifest
 from pipeline.sweep import Crew, Variant, asked, run
+
+WITH_RAY = pytest.mark.skipif(find_spec("prefect_ray") is None, reason="prefect-ray is not installed")
 
 
 def variants(folder: Path, changes: list[dict]) -> list[Variant]:
@@ -48,7 +51,7 @@ def kill_one_of_two(folder: Path, seen: list[str]) -> None:
     (folder / "stop in learn").unlink()
 
 
-@pytest.mark.parametrize("runner", ["dask", "process"])
+@pytest.mark.parametrize("runner", ["dask", "process", pytest.param("ray", marks=WITH_RAY)])
 def test_a_worker_killed_in_the_middle_loses_nothing(folder, prefect, runner, monkeypatch, capsys):
     """Two variants that differ in what is learned, on two workers."""
     for name in ("PYTHONPATH", "OMP_NUM_THREADS"):

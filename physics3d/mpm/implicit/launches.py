@@ -16,7 +16,7 @@ from physics3d.mpm.implicit.stiffness import stiffness
 from physics3d.mpm.implicit.stress import stress, stress_adjoint
 from physics3d.mpm.launches import Arguments, launch_over, record
 from physics3d.mpm.substep import Substeps
-from physics3d.mpm.threads import Wait, on_all
+from physics3d.mpm.threads import Wait
 from physics3d.warp_types import matrix, vector, vector4
 
 Call = tuple[wp.Kernel, Arguments, Arguments | None]  # kernel, its arguments, their adjoints if it is launched back
@@ -83,7 +83,7 @@ class StepLaunches:
             for launch in work[w]:
                 launch.launch()
 
-        on_all(self.arrays.workers, worker)
+        self.arrays.team.run(worker)
 
     def on_nodes(self, name: str) -> None:
         launch = self._launch(name, 0)
