@@ -4,8 +4,8 @@ Offsets are tried along a line, equally far apart. Where the lowest loss is at a
 the same step, so that a start which is a factor 100 off is found as one that is a factor 2 off; it ends at the span of
 the field. Between the best and its neighbours the middles are tried as well, for of two places to either side of the
 best valley one may lie in another. A valley is the narrower the more swings a clip shows: where the best that was tried
-explains little more than a picture that stands still, all of the line is looked at again between what was tried, once
-or twice. A second valley that is nearly as deep is said: then the clip, as far as the search
+explains little more than a picture that stands still, all of the line is looked at again between what was tried, and
+beyond its ends, once or twice. A second valley that is nearly as deep is said: then the clip, as far as the search
 sees, has two answers.
 """
 
@@ -49,11 +49,16 @@ def search(
         if tried[best].loss <= tried[best + side * step].loss:
             break
         best += side * step
-    still = chain.still(field.zero(), seed)
+    still, width = chain.still(field.zero(), seed), step
     while tried[best].loss > DEEP * still and step > FINE:
-        log.info("nothing that was tried explains much more than a picture that stands still: looking between")
-        at = sorted(tried)
-        for low, high in log.progress(list(itertools.pairwise(at)), "finer search"):
+        log.info(
+            "nothing that was tried explains much more than a picture that stands still: looking between and beyond"
+        )
+        ends = (min(tried), -1), (max(tried), 1)
+        beyond = [end + side * times * width for end, side in ends for times in (1, 2)]
+        for offset in [offset for offset in beyond if abs(offset) <= limit]:
+            measure(offset)
+        for low, high in log.progress(list(itertools.pairwise(sorted(tried))), "finer search"):
             measure((low + high) / 2)
         step /= 2
         best = min(tried, key=lambda offset: tried[offset].loss)

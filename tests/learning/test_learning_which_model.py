@@ -91,7 +91,7 @@ def field() -> GlobalField:
     return field_of(E, M, TAU)
 
 
-@pytest.mark.parametrize("off", [7.0, 10.0, 0.1])
+@pytest.mark.parametrize("off", [7.0, 10.0, 40.0, 0.1])
 def test_a_search_finds_a_valley_that_its_steps_skip(off):
     """Eight swings that hardly die leave a valley a tenth wide in stiffness to either side; the steps are factors of
     two."""
