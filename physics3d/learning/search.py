@@ -42,31 +42,29 @@ def search(
     for offset in log.progress(offsets, "coarse search"):
         measure(offset)
     step, limit = offsets[1] - offsets[0], math.log(field.span) + 1e-9
-    best = min(tried, key=lambda offset: tried[offset].loss)
+    lowest = lambda: min(tried, key=lambda offset: tried[offset].loss)
+    best = lowest()
     while (side := (best == max(tried)) - (best == min(tried))) and abs(best + side * step) <= limit:
         log.info(f"x{math.exp(best):.3g} is the best so far and the last that was tried: going on")
         measure(best + side * step)
         if tried[best].loss <= tried[best + side * step].loss:
             break
         best += side * step
-    still, width = chain.still(field.zero(), seed), step
-    while tried[best].loss > DEEP * still and step > FINE:
-        log.info(
-            "nothing that was tried explains much more than a picture that stands still: looking between and beyond"
-        )
-        ends = (min(tried), -1), (max(tried), 1)
-        beyond = [end + side * times * width for end, side in ends for times in (1, 2)]
-        for offset in [offset for offset in beyond if abs(offset) <= limit]:
-            measure(offset)
-        for low, high in log.progress(list(itertools.pairwise(sorted(tried))), "finer search"):
-            measure((low + high) / 2)
-        step /= 2
-        best = min(tried, key=lambda offset: tried[offset].loss)
     others = [other for other in valleys(tried) if other != best]
     for side in (-1, 1):
         if abs(best + side * step / 2) <= limit:
             measure(best + side * step / 2)
-    best = min(tried, key=lambda offset: tried[offset].loss)
+    best, width, still = lowest(), step, chain.still(field.zero(), seed)
+    while tried[best].loss > DEEP * still and step > FINE:
+        log.info("nothing tried explains much more than a picture that stands still: looking between and beyond")
+        ends = (min(tried), -1), (max(tried), 1)
+        beyond = [end + side * times * width for end, side in ends for times in (1, 2)]
+        places = [offset for offset in beyond if abs(offset) <= limit]
+        places += [(low + high) / 2 for low, high in itertools.pairwise(sorted([*tried, *places]))]
+        for offset in log.progress([place for place in places if place not in tried], "finer search"):
+            measure(offset)
+        best, step = lowest(), step / 2
+        others = [other for other in valleys(tried) if other != best]
     table = ", ".join(f"x{math.exp(offset):.3g}: {tried[offset].loss:.4g}" for offset in sorted(tried))
     log.info(f"coarse search over the stiffness ({table}): start at x{math.exp(best):.3g}")
     if others:
