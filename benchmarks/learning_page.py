@@ -143,6 +143,13 @@ def bars(runs: list[Row], failed: list[Row]) -> list[tuple[str, str, str, str]]:
     told = [abs(math.log10(float(row["density"]))) for row in runs if int(row["cameras"]) >= 3]
     given = f"{np.mean(told):.3f}" if told else ""
     found.append(("mean of abs(log10 of density as given/truth), the same runs", given, "", ""))
+    of_mass = [
+        abs(ratio(row, "E") / math.log(10) - math.log10(float(row["density"])))
+        for row in runs
+        if int(row["cameras"]) >= 3
+    ]
+    apart = f"{np.mean(of_mass):.3f}" if of_mass else ""
+    found.append(("mean of abs(log10 of E/density, found/truth), the same runs: what a swing tells", apart, "", ""))
     hits, total = covered(runs, ("tau",))
     found.append(("relaxation time inside its interval", f"{hits} of {total}", "all", said(0 < total == hits)))
     better = sum(float(row["psnr"]) > float(row["still"]) for row in runs)
