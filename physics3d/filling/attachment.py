@@ -58,10 +58,12 @@ def within_outline(position: np.ndarray, patch: np.ndarray, spacing: float) -> n
 
     The layer is the slab whose second moment is the patch's: one particle of a hundred that touches the rim of a pot
     above the soil, or a leaf's tip that lies on it, does not raise what holds the stem."""
+    if len(patch) < 4:
+        return np.zeros(len(position), bool)
     centre = patch.mean(0)
     _, size, axes = np.linalg.svd(patch - centre, full_matrices=False)
     thin = size[2] <= max(spacing * np.sqrt(len(patch)), FLAT * size[1])
-    if len(patch) < 4 or not thin or size[1] < 1e-3 * size[0]:
+    if not thin or size[1] < 1e-3 * size[0]:
         return np.zeros(len(position), bool)
     local, all_of_them = (patch - centre) @ axes.T, (position - centre) @ axes.T
     inside = Delaunay(local[:, :2]).find_simplex(all_of_them[:, :2]) >= 0

@@ -156,11 +156,12 @@ def test_stay_holds_an_uncertain_parameter_near_its_start():
 
 
 def seen_as(brightness, start: float, span: float = 1e4) -> tuple[Chain, GlobalField]:
-    """A chain whose picture is as bright as `brightness` of ln E, recorded at E = 1, with stripes that nothing
-    explains."""
+    """A chain whose second picture is as bright as `brightness` of ln E, recorded at E = 1, with stripes that nothing
+    explains; the first one is dark."""
     field = GlobalField(start={"youngs_modulus": torch.tensor(start)}, learn=("youngs_modulus",), span=span)
     simulate = lambda theta: field.parameters(theta)["youngs_modulus"].log()
-    render = lambda motion, view, frames: (0.5 + brightness(motion)).expand(len(frames), 3, 4, 3)
+    lit = lambda motion, frames: torch.where(frames > 0, 0.5 + brightness(motion), 0.3)
+    render = lambda motion, view, frames: lit(motion, frames)[:, None, None, None].expand(-1, 3, 4, 3)
     stripes = 0.01 * torch.tensor([1.0, -1.0, 1.0, -1.0])[:, None]
     clip = render(torch.tensor(0.0).double(), 0, torch.arange(2)) + stripes
     return Chain(simulate=simulate, render=render, clips={0: clip}, prior=Exemplar(blur=(0.0,))), field
