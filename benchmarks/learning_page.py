@@ -289,6 +289,8 @@ def draw_costs(rows: list[Row]):
                 float(row["seconds"]), value(row), marker, color=f"C{i % 10}", markersize=9, label=usual(row)
             )  # fmt: skip
         axis.set(xscale="log", xlabel="processor time of filling and learning [s]")
+        axis.xaxis.set_major_formatter(lambda seconds, _: f"{seconds:g}")
+        axis.xaxis.set_minor_formatter(lambda seconds, _: f"{seconds:g}" if f"{seconds:g}"[0] in "25" else "")
         axis.grid(alpha=0.3, which="both")
     figure.axes[0].set(ylabel="error of E [%]", yscale="log")
     figure.axes[1].set_ylabel("held-out push, foretold [dB]")

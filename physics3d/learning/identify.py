@@ -40,9 +40,8 @@ ASKED = 0.7  # of the unexplained motion
 SEEN = 1e-4  # what FAINT is for shapes that were read off a clip
 # of what is likely: k; g, for what softens by a tenth by rubbing has about as much damping again; and, in the logarithm
 WIDTH = {"slowing": 0.1, "loss": 1.0, "frequency": 0.05, "damping": 1.0}
-TAKES = np.array(
-    [0.03, 0.3]
-)  # what frequencies and dampings of one thing differ by from take to take, in the logarithm
+# what frequencies and dampings of one thing differ by from take to take, in the logarithm
+TAKES = np.array([0.03, 0.3])
 LEAST_DAMPING = 0.005  # that a refinement starts from, in 2 pi f
 LEAST_LARGE, MOST_LARGE = np.array([-0.3, -0.9]), np.array([0.3, 3.0])  # k, g
 TOLD = 0.9  # of the unexplained motion: the square of the amplitude has to leave less than the amplitude itself does

@@ -54,8 +54,10 @@ def search(
     for side in (-1, 1):
         if abs(best + side * step / 2) <= limit:
             measure(best + side * step / 2)
-    best, width, still = lowest(), step, chain.still(field.zero(), seed)
-    while tried[best].loss > DEEP * still and step > FINE:
+    best, width = lowest(), step
+    # a diffusion model's losses have a floor that no motion goes below, and cost minutes
+    explained = DEEP * chain.still(field.zero(), seed) if chain.certain else math.inf
+    while tried[best].loss > explained and step > FINE:
         log.info("nothing tried explains much more than a picture that stands still: looking between and beyond")
         ends = (min(tried), -1), (max(tried), 1)
         beyond = [end + side * times * width for end, side in ends for times in (1, 2)]
