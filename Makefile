@@ -1,4 +1,4 @@
-# Everything a user does, one line each. Values: make run SCENE=plush PROFILE=smoke DATA=../shared/data ARGS="learn.steps=50"
+# Everything a user does, one line each. Values: make run SCENE=plush PROFILE=smoke DATA=../shared/data learn.steps=50
 SCENE ?= carnation
 chosen := $(filter-out file,$(origin SCENE))
 PROFILE ?= default
@@ -29,6 +29,10 @@ PYTHON ?= python3
 words := SCENE PROFILE METHOD DATA ARGS PYTHON REAL PRED OUT FORMAT FRAME SIZE LENGTH MATERIAL UNSEEN RESULT \
 	 SCENES METHODS SEEDS RUNNER WORKERS ADDRESS PORT LISTEN
 $(foreach name,$(words),$(eval override $(name) := $$(value $(name))))
+# words for the configuration may stand beside them, make run SCENE=plush prior=tiny_video learn.steps=50, as if in ARGS
+letters := a% b% c% d% e% f% g% h% i% j% k% l% m% n% o% p% q% r% s% t% u% v% w% x% y% z%
+entries := $(foreach name,$(filter $(letters),$(.VARIABLES)),$(if $(filter command,$(firstword $(origin $(name)))),$(name)))
+override ARGS := $(ARGS)$(foreach name,$(sort $(entries)), '$(name)=$(subst ','\'',$(value $(name)))')
 export $(words)
 
 # files are UTF-8, whatever the locale says
@@ -136,11 +140,11 @@ newest: ## the tests with the newest version of everything, in an environment of
 	@$(quietly) .venv-newest/bin/python -m pip install --quiet --upgrade --upgrade-strategy eager --no-build-isolation -e '.[$(extras)]'
 	@OMP_NUM_THREADS=1 .venv-newest/bin/python -m pipeline.words -m pytest -n 2 --dist loadfile
 
-bench: $(ready) bench-speed bench-renderer bench-filling bench-embedding bench-simulation bench-swaying bench-stability bench-segmentation bench-reconstruction bench-motion bench-real bench-learning bench-starts ## measurements with plots, into docs/results; one alone: make bench-<name>
+bench: $(ready) bench-speed bench-renderer bench-filling bench-embedding bench-simulation bench-swaying bench-stability bench-segmentation bench-reconstruction bench-motion bench-real bench-learning bench-robustness ## measurements with plots, into docs/results; one alone: make bench-<name>
 
 # no `make setup`: a Python with torch, Warp, numpy, scipy, matplotlib, jaxtyping and annotated-types is enough
 bench-gpu: ## simulator and renderer on a GPU, right and how fast, under 8 minutes: [DATA=<folder with lego>] [ARGS="device=cuda seed=0"]
-	@$(threads) "$$(test -x $(py) && echo $(py) || echo "$$PYTHON")" benchmarks/gpu.py $$ARGS $${DATA:+data="$$DATA"}
+	@$(threads) "$$(test -x $(py) && echo $(py) || echo "$$PYTHON")" benchmarks/gpu.py $${ARGS//\'/} $${DATA:+data="$$DATA"}
 
 bench-%: export BENCH = $*
 bench-%: $(ready)

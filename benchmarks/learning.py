@@ -9,7 +9,8 @@ the pipeline from the filling on: fill, learn, simulate and render the push that
 twin's own, on its true surface, for reconstruction is slow; what is filled into them swings 1 to 4 % too fast, and
 `learn.beyond.surface` is 0.05 here. Every run is in the table, the best and the worst. Then the surface is taken away,
 and reconstructed from photographs, with the width of the default profile; and other truth that the learner was handed,
-one thing at a time.
+one thing at a time. Last, what error costs in time: fewer particles, frames or pixels, the grid, a field of stiffness,
+other ways down.
 
 A run that is done stands in the .csv and is not done again, so this may be stopped at any time; remove the file to
 begin anew. Times are processor time of one thread, for the machine is shared.
@@ -21,7 +22,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -56,6 +57,35 @@ WRONG = 1.1  # density and force as given, of the true ones, where they are take
 SHAPE = "shape"  # what is taken away where the surface is reconstructed
 PHOTOGRAPHED = ("reconstruct.iterations=600", "reconstruct.max_gaussians=6000", "reconstruct.longest_side=240")
 HANDED = ("nothing", "density", "force", "poissons_ratio", "tie of times", "ratio of mu to K", "all of these")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Way:
+    """How learning differs from what is usual here."""
+
+    spacing: float = 1.0  # of particles, and of cells, times as wide
+    frames: float = 1.0  # share of them
+    solver: str = "auto"
+    learn: dict[str, Any] = field(default_factory=dict)  # fields of the stage
+
+    def of(self, learn: Learn) -> Learn:
+        world: World = replace(learn.world, dx=self.spacing * learn.world.dx, solver=self.solver)
+        assert learn.frames is not None
+        return replace(learn, world=world, frames=round(self.frames * (learn.frames - 1)) + 1, **self.learn)
+
+
+WAYS = {
+    "particles 1.5 times as far apart": Way(spacing=1.5),
+    "particles twice as far apart": Way(spacing=2.0),
+    "half the frames": Way(frames=0.5),
+    "a quarter of the frames": Way(frames=0.25),
+    "pictures half as large": Way(learn={"image_scale": 0.5}),
+    "by the grid": Way(solver="grid"),
+    "a field of stiffness, 4 nodes": Way(learn={"nodes": 4}),
+    "no search": Way(learn={"search": 0}),
+    "the search alone": Way(learn={"polish": 0, "steps": 0}),
+    "search, 15 steps of Adam, no polish": Way(learn={"polish": 0, "steps": 15}),
+}
 NAMED = {
     "E": "youngs_modulus", "mu": "branch_shear_modulus", "tau": "shear_relaxation_time", "nu": "poissons_ratio",
 }  # fmt: skip
@@ -68,7 +98,8 @@ COLUMNS = (
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """One body, and what of its truth the learner is not handed besides the material; "": a density that is drawn."""
+    """One body, and what of its truth the learner is not handed besides the material, or one of `WAYS`; "": a density
+    that is drawn."""
 
     scene: str
     cameras: int
@@ -120,7 +151,7 @@ def runs(options: dict[str, str]) -> Iterator[Run]:
         for scene in options["scenes"].split(","):
             yield Run(scene=scene, cameras=3, seed=int(seed), taken=SHAPE)
     if SHOWN in options["scenes"].split(","):
-        for taken in HANDED:
+        for taken in (*HANDED, *WAYS):
             yield Run(scene=SHOWN, cameras=3, seed=0, taken=taken)
 
 
@@ -145,17 +176,20 @@ def learned(run: Run) -> dict[str, Any]:
     frames = len(capture.takes[0].videos[0])
     beyond = replace(learn.beyond, surface=SURFACE, density=DENSITY, length=0.0)
     learn = replace(learn, world=twin.given, frames=frames, beyond=beyond, guess_widths={})
+    way = WAYS.get(run.taken, Way())
     began = time.process_time()
     if run.taken == SHAPE:
         capture = photographed(twin, source, run.seed)
         gaussians = of("reconstruct")(capture, log=Log(None))
         learn = replace(learn, beyond=replace(beyond, surface=of("learn").beyond.surface))
+    elif run.taken in WAYS:
+        learn = way.of(without(HANDED[0], learn, twin))
     elif run.taken:
         learn = without(run.taken, learn, twin)
         capture = replace(
             capture, takes=tuple(replace(take, excitation=pushed(run.taken, take.excitation)) for take in capture.takes)
         )
-    body = replace(fill, spacing=twin.spacing)(capture, gaussians, None, log=Log(None))
+    body = replace(fill, spacing=way.spacing * twin.spacing)(capture, gaussians, None, log=Log(None))
     estimate = learn(capture, gaussians, body, log=Log(None))
     seconds = time.process_time() - began
     take = capture.take("evaluate")

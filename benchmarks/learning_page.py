@@ -34,6 +34,7 @@ clips, the shape, the push and a wrong weight, and believed at first that the th
   foretold [dB]. More is better; the noise of the clips lets nobody much above {ceiling:.1f} dB.
 """
 
+USUAL = "nothing"  # is taken away in the run that other ways are compared with
 SHAPE = "shape"  # what is taken away in the runs whose surface is reconstructed
 PHOTOGRAPHED = """
 The same bodies, clips and starts by three cameras, but the learner has the shape from {shots} photographs of {width} x
@@ -45,10 +46,16 @@ push, Poisson's ratio, that both relaxation times are one, and the ratio of both
 taken away: density and push are 10 % wrong, and are known to be uncertain by as much; Poisson's ratio is learned, from
 0.1 too low; what was tied is learned apart.
 """
+OTHERWISE = """
+The {scene} by {cameras} cameras once more, handed all but what it learns, with one thing otherwise than usual. Times
+are processor time of filling and learning on one thread; "usual" is the row "nothing" of the table above.
+"""
 
 
 def write(rows: list[Row], folder: Path, total: int) -> None:
     """`learning.md` and `learning.png`, of the rows of `learning.csv`; `total` runs were asked for."""
+    from learning import HANDED
+
     done = [row for row in rows if not row["failed"]]
     runs = [row for row in done if not row["taken"]]
     failed = [row for row in rows if row["failed"]]
@@ -70,9 +77,13 @@ def write(rows: list[Row], folder: Path, total: int) -> None:
     ]
     shaped = [row for row in done if row["taken"] == SHAPE]
     lines += ["", "## The shape from photographs", "", *photographed(runs, shaped)]
-    others = [row for row in done if row["taken"] not in ("", SHAPE)]
+    others = [row for row in done if row["taken"] in HANDED]
     lines += ["", "## What each thing that is handed over is worth", "", *handed(others)]
+    ways = [row for row in done if row["taken"] not in ("", SHAPE, *HANDED[1:])]
+    lines += ["", "## Error against run time", "", *otherwise(ways)]
     (folder / "learning.md").write_text("\n".join(lines) + "\n")
+    if len(ways) > 1:
+        draw_costs(ways).savefig(folder / "learning_costs.png", dpi=100)
     draw(runs).savefig(folder / "learning.png", dpi=100)
 
 
@@ -132,6 +143,13 @@ def bars(runs: list[Row], failed: list[Row]) -> list[tuple[str, str, str, str]]:
     told = [abs(math.log10(float(row["density"]))) for row in runs if int(row["cameras"]) >= 3]
     given = f"{np.mean(told):.3f}" if told else ""
     found.append(("mean of abs(log10 of density as given/truth), the same runs", given, "", ""))
+    of_mass = [
+        abs(ratio(row, "E") / math.log(10) - math.log10(float(row["density"])))
+        for row in runs
+        if int(row["cameras"]) >= 3
+    ]
+    apart = f"{np.mean(of_mass):.3f}" if of_mass else ""
+    found.append(("mean of abs(log10 of E/density, found/truth), the same runs: what a swing tells", apart, "", ""))
     hits, total = covered(runs, ("tau",))
     found.append(("relaxation time inside its interval", f"{hits} of {total}", "all", said(0 < total == hits)))
     better = sum(float(row["psnr"]) > float(row["still"]) for row in runs)
@@ -230,6 +248,52 @@ def handed(rows: list[Row]) -> list[str]:
         bar = f"the bar is {OF_NU} where the clip determines it"
         lines += ["", f"Poisson's ratio, where it is learned, is wrong by at most {worst:.2f}; {bar}."]
     return lines
+
+
+def usual(row: Row) -> str:
+    """What a way is called."""
+    return "usual" if row["taken"] == USUAL else row["taken"]
+
+
+def otherwise(rows: list[Row]) -> list[str]:
+    """Of one body: what is learned and foretold, and how long it takes."""
+    if len(rows) < 2:
+        return ["No run yet."]
+    lines = [
+        *OTHERWISE.format(**rows[0]).strip().splitlines(),
+        "",
+        "![error and foretelling against time](learning_costs.png)",
+        "",
+        "| | particles | time [s] | E found / truth | 90 % | mu_N found / truth | tau found / truth | learned [dB] |",
+        "|---" * 8 + "|",
+    ]
+    for row in rows:
+        found = [f"{math.exp(ratio(row, 'E')):.3f}", between(row, "E")]
+        found += [f"{math.exp(ratio(row, name)):.3f}" for name in ("mu", "tau")]
+        cells = [usual(row), row["particles"], f"{float(row['seconds']):.0f}", *found, f"{float(row['psnr']):.1f}"]
+        lines.append(f"| {' | '.join(cells)} |")
+    return lines
+
+
+def draw_costs(rows: list[Row]):
+    """Error of E, and what the held-out push is foretold at, against time."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10, 6), layout="constrained")
+    error = lambda row: 100 * abs(math.expm1(ratio(row, "E")))
+    foretold = lambda row: float(row["psnr"])
+    for axis, value in zip(figure.subplots(1, 2), (error, foretold)):
+        for i, row in enumerate(rows):
+            marker = "o*sDv^<>PXh"[i % 11]
+            axis.plot(
+                float(row["seconds"]), value(row), marker, color=f"C{i % 10}", markersize=9, label=usual(row)
+            )  # fmt: skip
+        axis.set(xscale="log", xlabel="processor time of filling and learning [s]")
+        axis.grid(alpha=0.3, which="both")
+    figure.axes[0].set(ylabel="error of E [%]", yscale="log")
+    figure.axes[1].set_ylabel("held-out push, foretold [dB]")
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
+    return figure
 
 
 def draw(runs: list[Row]):

@@ -40,6 +40,7 @@ class Motion:
     modes: modes.Solver | None  # None: the grid
     device: str
     log: Log
+    feels_walls: bool = True  # False: the modes go on through a wall that they do not feel
     said: set[str] = field(default_factory=set)  # what was said already: a body is moved hundreds of times
 
     def __call__(
@@ -53,16 +54,15 @@ class Motion:
                 return motion
         return grid.rollout(self.world, parameters, self.position, self.volume, excitation=self.excitation, **timing)
 
-    def settled(self, parameters: Values, *, velocity: Tensor | None, frames: int, frame_dt: float) -> "Motion":
-        """Itself, or the body moved by the grid alone where the modes do not serve with these parameters: trials that
-        one solver moves and then the other have steps in their loss, and cost the time of both."""
-        if self.modes is None or self.world.solver == "modes":
-            return self
+    def passes_a_wall(self, parameters: Values, *, velocity: Tensor | None, frames: int, frame_dt: float) -> bool:
+        """Whether modes move the body and this motion reaches a wall, which they do not feel; it is said once."""
+        if self.modes is None or self.world.solver == "modes" or not self.modes.model.conditions.walls:
+            return False
         timing: dict[str, Any] = dict(
             velocity=velocity, frames=frames, frame_dt=frame_dt, device=self.device, log=Log(None)
         )
         with torch.no_grad():
-            return self if self._by_modes(parameters, timing) is not None else replace(self, modes=None)
+            return replace(self, feels_walls=True)._by_modes(parameters, timing) is None
 
     def report(self, parameters: Values) -> None:
         """Say how the body vibrates with these parameters, if it is moved by its modes."""
@@ -85,7 +85,7 @@ class Motion:
             why = str(reason).partition("; take ")[0]  # its remedies are for those who want no grid
             self._say("no motion", f"the modes find no motion ({why}): the grid takes over")
             return None
-        touch = _touched(self.modes, self.volume, motion.position)
+        touch = _touched(self.modes, self.volume, motion.position) if self.feels_walls else None
         if touch is None:
             return motion
         wall, frame = touch

@@ -2,27 +2,43 @@
 
     python -m pipeline.compare scenes=... [methods=...] [out=...] [runner=thread|process|dask] [workers=1] [key=value]
 
-Every method of conf/method runs on every scene, as `make sweep` runs them: what they have in common is computed once,
-and a second call goes on where the first was stopped. Beside them stand the first picture frozen and, where a motion
-was recorded whose cause is known, a deformation field without physics that is fitted to it (`stages/deform.py`). All
-are judged by the take that nobody learned from. Of real takes, whose cause nobody knows, there is the table of what is
-foretold; METHODS=physics3d is enough for them. What could not be computed stands in the table with the reason.
+Scene by scene every method of conf/method runs, as `make sweep` runs them: what they have in common is computed once,
+and a second call goes on where the first was stopped. Beside them stand the first picture frozen and a deformation
+field without physics that is fitted to the recorded take (`stages/deform.py`). All are judged by the take that nobody
+learned from. The page is written after every scene, so whoever stops has a page of what ended.
+
+Of recorded takes whose cause nobody knows the rows are those of what is foretold (`stages/foretell.py`), means over the
+takes: the given material is there, a deformation field is what it would be fitted to, played again, and methods that
+cannot be asked are left out with the reason. What was asked and could not be computed stands in the table likewise.
 
 PROFILE=smoke takes minutes for a scene. `compare_page.py` says what is written. Exit codes as `make sweep`.
 """
 
+import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 
-from pipeline.compare_page import FIELD, FILMED, FROZEN, METRICS, WHOLE, Row, write
+from pipeline.compare_page import FIELD, FILMED, FROZEN, METRICS, WHOLE, Compared, Row, write
 from pipeline.filed import one_line
-from pipeline.flow import Plan, first, plan
+from pipeline.flow import Plan, cause_unknown, first, plan
 from pipeline.places import folder_to_fill
+from pipeline.server import server
 from pipeline.settings import SettingsError, choices
 from pipeline.shelf import using
 from pipeline.stage import StageError, Step, here, manifest, peek, run
-from pipeline.sweep import OWN, Variant, asked, swept
-from pipeline.told import Parameter, Table, parameters, scores
+from pipeline.sweep import OWN, Crew, Variant, asked, swept
+from pipeline.told import Parameter, Table, models, parameters, scores
+
+GIVEN = "physgaussian"  # the method that learns nothing
+# what rows of takes of unknown cause are called in the table of methods; others keep their names
+FORETOLD = {
+    "modes as seen": WHOLE,
+    "material before": GIVEN,
+    "frame 0, frozen": FROZEN,
+    "what was seen, again": FIELD,
+}
+BESIDE = (WHOLE, FIELD, FROZEN)  # what a run of the whole method gives rows of
 
 
 def main(words: list[str]) -> int:
@@ -43,27 +59,62 @@ def compare(words: list[str]) -> int:
     settings = [f"runner={own.get('runner') or 'thread'}", f"workers={own.get('workers') or '1'}", *rest]
     crew, variants = asked([f"scenes={scenes}", f"methods={','.join(methods)}", *settings])
     output = Path(variants[0].config["output"]).expanduser().resolve()
-    usual = output / "comparisons" / "-".join(dict.fromkeys(v.scene for v in variants))
-    folder = folder_to_fill({"OUT": own.get("out", "")}, usual)
-    states = swept(crew, variants)
-    rows: list[Row] = []
-    lost: dict[tuple[str, str], str] = {}
-    for variant in variants:
-        if (state := str(states[variant]["state"])) != "done":
-            lost[variant.scene, variant.method] = state
-            if variant.method == WHOLE:
-                lost[variant.scene, FIELD] = lost[variant.scene, FROZEN] = f"{WHOLE} did not end"
+    names = list(dict.fromkeys(v.scene for v in variants))
+    folder = folder_to_fill({"OUT": own.get("out", "")}, output / "comparisons" / "-".join(names))
+    with using(output / "artifacts"):  # a place that cannot be written is said before a server is waited for
+        pass
+    found = Compared()
+    with server(output / ".prefect", meanwhile=lambda: None, host=crew.host()):  # one for all scenes
+        for name in names:
+            found.add(of_scene(crew, [v for v in variants if v.scene == name]))
+            if found.rows:
+                write(folder, found, variants[0].config, words=rest)
+    if not found.rows:
+        raise StageError(f"no method ended on any scene: {next(iter(found.lost.values()))}")
+    print(f"comparison {folder / 'compare.md'}")
+    return 1 if found.lost else 0
+
+
+def of_scene(crew: Crew, variants: list[Variant]) -> Compared:
+    """All methods on one scene: first the whole one, which shows what the others can be asked."""
+    whole = next(v for v in variants if v.method == WHOLE)
+    found = Compared()
+    states = tried(crew, [whole])
+    if states[whole] != "done":
+        found.lost = {(whole.scene, method): f"{WHOLE} did not end" for method in BESIDE}
+    others = [v for v in variants if v is not whole]
+    if states[whole] == "done" and cause_unknown(peek(planned(whole)[1]["capture"].folder)):
+        found.left_out = {(v.scene, v.method): why for v in others if (why := unasked(v, whole))}
+        others = []
+    states |= tried(crew, others)
+    for variant in (whole, *others):
+        if states[variant] != "done":
+            found.lost[variant.scene, variant.method] = states[variant]
             continue
         for method, make in ((variant.method, of_variant), (FIELD, deformed)):
             try:
-                rows += make(variant)
+                found.rows += make(variant)
             except StageError as error:
-                lost[variant.scene, method] = str(error)
-    if not rows:
-        raise StageError(f"no method ended on any scene: {next(iter(lost.values()))}")
-    write(folder, rows, lost, variants[0].config, words=rest)
-    print(f"comparison {folder / 'compare.md'}")
-    return 1 if lost else 0
+                found.lost[variant.scene, method] = str(error)
+    return found
+
+
+def tried(crew: Crew, variants: list[Variant]) -> dict[Variant, str]:
+    """Variant -> done, or what went wrong, here or before any of them could begin."""
+    try:
+        return {variant: str(row["state"]) for variant, row in swept(crew, variants).items()} if variants else {}
+    except StageError as error:
+        return dict.fromkeys(variants, str(error))
+
+
+def unasked(variant: Variant, whole: Variant) -> str:
+    """Why a method is not asked about takes whose cause nobody knows; nothing of one that learns nothing, whose row is
+    in the table of what is foretold."""
+    if not variant.config["learn"]:
+        return ""
+    if variant.config["material"]["model"] != whole.config["material"]["model"]:
+        return f"a motion of unknown cause is learned with the material of {WHOLE} alone"
+    return "the thing swings in the modes that were seen, whatever is inside"
 
 
 def of_variant(variant: Variant) -> list[Row]:
@@ -75,25 +126,42 @@ def of_variant(variant: Variant) -> list[Row]:
     if not tables:
         raise StageError(f"{variant.scene} has no recorded motion to compare with; leave it out of SCENES")
     table, is_whole = tables[0], variant.method == WHOLE
-    if table.step == "foretell":
-        return [Row(scene=variant.scene, method=n, scores=_numbers(table, n)) for n in table.values if is_whole]
-    name = next(n for n in ("learned", "initial") if n in table.values)
+    name = next((n for n in ("learned", "initial") if n in table.values), "")
     found = Row(
         scene=variant.scene,
         method=variant.method,
-        scores=_numbers(table, name),
+        scores=_numbers(table.values[name]) if name else {},
         seconds=sum(_seconds(step) for step in steps.values() if not step.name.endswith("_initial")),
-        learned={p.name: _found(p) for p in parameters(whole) if p.low is not None},
-        video=read(steps["render"]).frames[0],
+        learned=_learned(variant, whole),
+        models=models(whole) if is_whole else [],
     )
+    if table.step == "foretell":
+        return of_takes(found, table)
+    found = replace(found, video=read(steps["render"]).frames[0])
     if not is_whole:
         return [found]
     capture = read(steps["capture"])
     take = capture.take("evaluate") or capture.take("learn")
     camera = (take.held_out_cameras or (0,))[0]
-    filmed = Row(scene=variant.scene, method=FILMED, scores={}, video=take.videos[camera])
-    still = [Row(scene=variant.scene, method=n, scores=_numbers(table, n)) for n in table.values if "frozen" in n]
+    filmed = Row(scene=variant.scene, method=FILMED, scores={}, video=take.videos[camera], fps=take.fps)
+    still = [Row(scene=variant.scene, method=n, scores=_numbers(table.values[n])) for n in table.values if n == FROZEN]
     return [filmed, *still, found]
+
+
+def of_takes(whole: Row, table: Table) -> list[Row]:
+    """Rows of what was foretold of takes of unknown cause, means over the takes; `whole`: what else is known of it."""
+    by_name: dict[str, list[dict[str, float]]] = {}
+    for key, cells in table.values.items():
+        by_name.setdefault(key.partition(": ")[2], []).append(_numbers(cells))
+    rows = []
+    for name, takes in by_name.items():
+        method = FORETOLD.get(name, name)
+        known = [m for m in METRICS if all(m in take for take in takes)]
+        if means := {m: math.fsum(take[m] for take in takes) / len(takes) for m in known}:
+            rows.append(
+                replace(whole if method == WHOLE else Row(scene=whole.scene, method=method, scores={}), scores=means)
+            )
+    return rows
 
 
 def planned(variant: Variant) -> tuple[Plan, dict[str, Step]]:
@@ -103,8 +171,15 @@ def planned(variant: Variant) -> tuple[Plan, dict[str, Step]]:
     return whole, {step.name: step for step in whole.steps}
 
 
-def _numbers(table: Table, row: str) -> dict[str, float]:
-    return {k: v for k, v in table.values[row].items() if k in METRICS and v is not None}
+def _numbers(cells: dict[str, float | None]) -> dict[str, float]:
+    return {k: v for k, v in cells.items() if k in METRICS and v is not None}
+
+
+def _learned(variant: Variant, whole: Plan) -> dict[str, str]:
+    """Parameter -> what was learned, in words; of those that share one factor the first alone."""
+    ties: list[list[str]] = (variant.config["learn"] or {}).get("ties") or []
+    follow = {name for tie in ties for name in tie[1:]}
+    return {p.name: _found(p) for p in parameters(whole) if p.low is not None and p.name not in follow}
 
 
 def _found(parameter: Parameter) -> str:
@@ -143,7 +218,7 @@ def deformed(variant: Variant) -> list[Row]:
         Row(
             scene=variant.scene,
             method=FIELD,
-            scores=_numbers(table, FIELD),
+            scores=_numbers(table.values[FIELD]),
             seconds=sum(map(_seconds, (*needed, motion, video, judged))),
             video=read(video).frames[0],
         )

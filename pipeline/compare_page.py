@@ -1,5 +1,7 @@
 """What `make compare` writes: compare.md with one table for each scene, compare.csv, compare.png (error against run
-time), and a sheet of pictures for each scene. Each file is complete under its name, or not there."""
+time), and a sheet of pictures for each scene. Each file is complete under its name, or not there.
+
+What others have published of the same things stands below (`published.py`)."""
 
 import csv
 import re
@@ -8,13 +10,33 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.filed import beside
+from pipeline.published import published
 from pipeline.settings import CONF, choices, described
 from pipeline.stage import here
 
 FIELD, FROZEN, FILMED = "deformation_field", "frozen first frame", "filmed"
 METRICS = ("psnr", "ssim", "ms_ssim", "vmaf", "motion_psnr", "flow_error")
 WHOLE = "physics3d"  # the method with which the others compare
+IMAGE = "image modes"  # a row that only takes of unknown cause have
 INSTANTS = 6  # pictures of a sheet
+PANELS = 4  # of the plot, side by side
+MARKS = "oxd"  # of methods in the plot, for each ten of them
+TOLD = {  # what rows are, besides the methods of conf/method
+    FROZEN: "the first picture, standing still",
+    FIELD: "a deformation field without physics, fitted to the recorded clip (the peer is DreamGaussian4D)",
+    IMAGE: "the flow of what was seen goes on as it swung, without a body",
+    "last frame seen, frozen": "the last picture that was seen, standing still",
+    "mean of the first half": "the mean of the pictures that were seen",
+    "learned material": "the motion of the learned material alone, in modes that nothing has corrected",
+}
+OF_TAKES = [
+    "Of real takes nobody knows the cause, and no method can be told the force. Of the first the first half is learned",
+    "from and the rest foretold, of the others half a second from their release on is seen, in which the start is",
+    f"sought; rows are means over the takes. There {WHOLE} swings by the modes that were seen, physgaussian by the",
+    "material before learning, and deformation_field plays again what was seen, as one would that fits it without",
+    "error.",
+    "",
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,10 +49,35 @@ class Row:
     seconds: float | None = None  # of the stages that this method needs
     learned: dict[str, str] = field(default_factory=dict)  # parameter -> value and interval, in words
     video: Any = None  # uint8 [t, h, w, 3] of the first camera that judges
+    fps: float | None = None  # of what was filmed [1/s]
+    models: list[str] = field(default_factory=list)  # which simpler ones the clip leaves open, what would settle it
 
     @property
     def name(self) -> str:
         return self.method.replace("_", " ")
+
+
+@dataclass
+class Compared:
+    """What is known of some scenes; keys are (scene, method)."""
+
+    rows: list[Row] = field(default_factory=list)
+    lost: dict[tuple[str, str], str] = field(default_factory=dict)  # why there is no row
+    left_out: dict[tuple[str, str], str] = field(default_factory=dict)  # why there can be none
+
+    def add(self, other: "Compared") -> None:
+        self.rows += other.rows
+        self.lost |= other.lost
+        self.left_out |= other.left_out
+
+    @property
+    def scenes(self) -> list[str]:
+        return list(dict.fromkeys([*(row.scene for row in self.rows), *(scene for scene, _ in self.lost)]))
+
+    def of(self, scene: str) -> "Compared":
+        mine = lambda cells: {key: why for key, why in cells.items() if key[0] == scene}
+        rows = [row for row in self.rows if row.scene == scene]
+        return Compared(rows=rows, lost=mine(self.lost), left_out=mine(self.left_out))
 
 
 def better(filmed: Any, one: Any, other: Any, *, seed: int = 0) -> tuple[float, float, float]:
@@ -51,41 +98,31 @@ def better(filmed: Any, one: Any, other: Any, *, seed: int = 0) -> tuple[float, 
     return float(gain.mean()), float(np.quantile(means, 0.05)), float(np.quantile(means, 0.95))
 
 
-def write(
-    folder: Path, rows: list[Row], lost: dict[tuple[str, str], str], config: dict[str, Any], *, words: list[str]
-) -> None:
-    """`lost`: (scene, method) -> why there is no row; `words` said more than scenes and methods, e.g. profile=smoke.
-    Raises OSError if there is no room."""
+def write(folder: Path, found: Compared, config: dict[str, Any], *, words: list[str]) -> None:
+    """`words` said more than scenes and methods, e.g. profile=smoke. Raises OSError if there is no room."""
     folder.mkdir(parents=True, exist_ok=True)
     with beside(folder / "compare.csv", over=True) as hidden, hidden.open("w", newline="") as file:
         writer = csv.DictWriter(file, ["scene", "method", "seconds", *METRICS], restval="")
         writer.writeheader()
-        writer.writerows({"scene": r.scene, "method": r.method, "seconds": r.seconds, **r.scores} for r in rows)
+        writer.writerows({"scene": r.scene, "method": r.method, "seconds": r.seconds, **r.scores} for r in found.rows)
     with beside(folder / "compare.png", over=True) as hidden:
-        plot(rows).savefig(hidden, dpi=100)
-    scenes = list(dict.fromkeys([*(row.scene for row in rows), *(scene for scene, _ in lost)]))
-    for scene in scenes:
-        sheet(folder / f"compare_{scene}.jpg", [row for row in rows if row.scene == scene])
+        plot(found.rows).savefig(hidden, dpi=100)
+    for scene in found.scenes:
+        sheet(folder / f"compare_{scene}.jpg", found.of(scene).rows)
     with beside(folder / "compare.md", over=True) as hidden:
-        hidden.write_text(page(rows, lost, scenes, config, words))
+        hidden.write_text(page(found, config, words))
 
 
-def page(
-    rows: list[Row], lost: dict[tuple[str, str], str], scenes: list[str], config: dict[str, Any], words: list[str]
-) -> str:
+def page(found: Compared, config: dict[str, Any], words: list[str]) -> str:
     """compare.md."""
     from physics3d.machine import machine
 
-    told = {name: described(CONF / "method" / f"{name}.yaml") for name in choices("method")}
-    told |= {
-        FROZEN: "the first picture, standing still",
-        FIELD: "a deformation field without physics, fitted to the recorded clip (the peer is DreamGaussian4D)",
-    }
-    used = sorted({row.method for row in rows if row.scores}, key=rank)
+    told = {name: described(CONF / "method" / f"{name}.yaml") for name in choices("method")} | TOLD
+    used = sorted({row.method for row in found.rows if row.scores}, key=rank)
     lines = [
         "# Methods compared",
         "",
-        f"`{command(scenes, words)}`, seed {config['seed']}. Written on {machine(here(config['device']))}.",
+        f"`{command(found.scenes, words)}`, seed {config['seed']}. Written on {machine(here(config['device']))}.",
         "",
         "All learn from one recorded motion and are judged by another one, of another force, that nobody saw. More is",
         "better, but for the error of the flow, which is relative to the motion: 1 is that of a picture that stands",
@@ -94,22 +131,26 @@ def page(
         "",
         *(f"- **{name}**: {told.get(name, name)}" for name in used),
         "",
-        *overall(rows, lost, scenes),
+        *(OF_TAKES if any(row.method == IMAGE for row in found.rows) else ()),
+        *overall(found),
         "",
         "![error against run time](compare.png)",
     ]
-    for scene in scenes:
-        of_scene = [row for row in rows if row.scene == scene]
-        lines += section(scene, of_scene, {method: why for (s, method), why in lost.items() if s == scene})
-    return "\n".join(lines) + "\n"
+    for scene in found.scenes:
+        lines += section(scene, found.of(scene))
+    return "\n".join([*lines, *published()]) + "\n"
 
 
-def section(scene: str, rows: list[Row], lost: dict[str, str]) -> list[str]:
-    """The tables and the sheet of one scene; `lost`: method -> why there is no row."""
-    table = sorted((row for row in rows if row.scores), key=lambda row: rank(row.method))
+def section(scene: str, found: Compared) -> list[str]:
+    """The tables and the sheet of one scene."""
+    table = sorted((row for row in found.rows if row.scores), key=lambda row: rank(row.method))
     # what pictures are too small for, or a thing moves too little, is no column
     measures = [m for m in METRICS if any(m in row.scores for row in table)]
-    lines = ["", f"## {scene}", "", "| method | " + " | ".join(m.replace("_", " ") for m in measures) + " | s |"]
+    lines = ["", f"## {scene}", ""]
+    for row in found.rows:
+        if row.method == FILMED and row.fps is not None:
+            lines += [f"The unseen motion is filmed for {len(row.video) / row.fps:.2g} s.", ""]
+    lines += ["| method | " + " | ".join(m.replace("_", " ") for m in measures) + " | s |"]
     lines += ["|---" * (len(measures) + 2) + "|"]
     best = {}
     for m in measures:
@@ -118,12 +159,18 @@ def section(scene: str, rows: list[Row], lost: dict[str, str]) -> list[str]:
     for row in table:
         cells = [cell(row.scores.get(m), best[m]) for m in measures]
         lines.append(f"| {row.method} | {' | '.join(cells)} | {'' if row.seconds is None else round(row.seconds)} |")
-    for method, why in lost.items():
+    reasons = [("not done", *one) for one in found.lost.items()]
+    reasons += [("left out", *one) for one in found.left_out.items()]
+    for verdict, (_, method), why in reasons:
         why = re.sub(r" \(traceback: .*\)$", "", why).replace("|", "/")  # a file of this machine tells no reader
-        lines.append(f"| {method} | not done: {why} |" + " |" * len(measures))
-    lines += ["", *ties(rows), ""]
-    lines += [f"- {row.method} learned {n}: {v}" for row in table for n, v in row.learned.items()]
-    if any(row.video is not None for row in rows):
+        lines.append(f"| {method} | {verdict}: {why} |" + " |" * len(measures))
+    lines += ["", *ties(found.rows), ""]
+    lines += [
+        f"- {row.method} learned " + "; ".join(f"{name} {value}" for name, value in row.learned.items())
+        for row in table
+        if row.learned
+    ]
+    if any(row.video is not None for row in found.rows):
         lines += ["", f"![{scene}: what was filmed, and the methods at the same instants](compare_{scene}.jpg)"]
     return lines
 
@@ -143,27 +190,34 @@ def command(scenes: list[str], words: list[str]) -> str:
     return " ".join(["make compare", f"SCENES={','.join(scenes)}", *named, *more])
 
 
-def overall(rows: list[Row], lost: dict[tuple[str, str], str], scenes: list[str]) -> list[str]:
-    """The PSNR of every method on every scene, and means over the scenes on which every method that ran ended."""
-    of = {(row.scene, row.method): row.scores["psnr"] for row in rows if "psnr" in row.scores}
-    methods = sorted({m for _, m in of} | {m for _, m in lost}, key=rank)
-    ran = [method for method in methods if method in (*choices("method"), FIELD, FROZEN)]
-    whole = [scene for scene in scenes if all((scene, method) in of for method in ran)]
+def overall(found: Compared) -> list[str]:
+    """One row for each method, one column for each scene, and the means over what can be compared."""
+    of = {(row.scene, row.method): row.scores["psnr"] for row in found.rows if "psnr" in row.scores}
+    asked = {method for _, method in (*of, *found.lost, *found.left_out)}
+    methods = sorted(asked, key=rank)
+    # what only some scenes have rows of, such as image modes, is compared there alone
+    tried = {method for _, method in (*of, *found.lost)} & {*choices("method"), FIELD, FROZEN}
+    ran = [method for method in methods if method in tried]
+    whole = [scene for scene in found.scenes if all((scene, method) in of for method in ran)]
     mean = {m: sum(of[scene, m] for scene in whole) / len(whole) for m in ran} if whole else {}
-    best = {scene: max((of[scene, m] for m in methods if (scene, m) in of), default=None) for scene in scenes}
+    best = {scene: max((of[scene, m] for m in methods if (scene, m) in of), default=None) for scene in found.scenes}
+
+    def entry(scene: str, method: str) -> str:
+        if (scene, method) in found.lost:
+            return "not done"
+        return "-" if (scene, method) in found.left_out else cell(of.get((scene, method)), best[scene])
+
     lines = [
-        f"PSNR of the unseen motion in dB; the mean is that of {len(whole)} of {len(scenes)} scenes, on which every",
-        "method ended.",
+        f"PSNR of the unseen motion in dB; the mean is that of {len(whole)} of {len(found.scenes)} scenes, on which",
+        "every method ended."
+        + (" A dash: the method is not asked there, why is said below." if found.left_out else ""),
         "",
-        "| method | " + " | ".join(scenes) + " | mean |",
-        "|---" * (len(scenes) + 2) + "|",
+        "| method | " + " | ".join(found.scenes) + " | mean |",
+        "|---" * (len(found.scenes) + 2) + "|",
     ]
     for method in methods:
-        cells = [
-            "not done" if (scene, method) in lost else cell(of.get((scene, method)), best[scene]) for scene in scenes
-        ]
         last = cell(mean.get(method), max(mean.values(), default=None))
-        lines.append(f"| {method} | {' | '.join(cells)} | {last} |")
+        lines.append(f"| {method} | {' | '.join(entry(scene, method) for scene in found.scenes)} | {last} |")
     return lines
 
 
@@ -183,9 +237,10 @@ def ties(rows: list[Row]) -> list[str]:
             alike.append(row.name)
     if alike:
         lines.append(
-            f"- This clip does not tell {', '.join([best.name, *alike])} apart. What would: a recording that goes on "
-            "until the motion has died away, a second force, or a weight hung on the thing."
+            f"- This clip does not tell {', '.join([best.name, *alike])} apart. What would: sharper pictures, a "
+            "recording that goes on until the motion has died away, a second force, or a weight hung on the thing."
         )
+        lines += [f"- {row.name} itself says: {sentence}" for row in judged for sentence in row.models]
     return lines
 
 
@@ -197,22 +252,37 @@ def cell(value: float | None, best: float | None) -> str:
 
 
 def plot(rows: list[Row]) -> Any:
-    """Error against run time, a panel for each scene."""
+    """Error against run time, a panel for each scene; below them what the colours mean."""
     from matplotlib.figure import Figure
 
     scenes = list(dict.fromkeys(row.scene for row in rows))
     methods = sorted({row.method for row in rows if "psnr" in row.scores}, key=rank)
-    figure = Figure(figsize=(5.2 * len(scenes), 4.0), layout="constrained")
-    for axis, scene in zip(figure.subplots(1, len(scenes), squeeze=False)[0], scenes):
-        for row in sorted(rows, key=lambda row: rank(row.method)):
+    across = min(PANELS, len(scenes))
+    down = -(-len(scenes) // across)
+    figure = Figure(figsize=(3.6 * max(2, across), 2.9 * down + 1.0), layout="constrained")
+    panels = figure.subplots(down, across, squeeze=False)
+    keys: dict[str, Any] = {}
+    for axis, scene in zip(panels.flat, scenes):
+        for row in rows:
             if row.scene != scene or "psnr" not in row.scores:
                 continue
+            colour = f"C{methods.index(row.method) % 10}"
             if row.seconds is None:
-                axis.axhline(row.scores["psnr"], color="0.5", linestyle=":", label=row.method)
+                line = axis.axhline(row.scores["psnr"], color=colour, linestyle=":")
+                keys.setdefault(row.method, line)  # a point, where there is one, says more
             else:
-                axis.plot(row.seconds, row.scores["psnr"], "o", color=f"C{methods.index(row.method)}", label=row.method)
-        axis.set(title=scene, xlabel="run time [s]", ylabel="PSNR of the unseen motion [dB]", xscale="log")
-        axis.legend(fontsize=7)
+                (keys[row.method],) = axis.plot(
+                    row.seconds, row.scores["psnr"], MARKS[methods.index(row.method) // 10], color=colour
+                )
+        axis.set(title=scene, xscale="log")
+        axis.xaxis.set_major_formatter(lambda value, at: f"{value:g}")
+        axis.xaxis.set_minor_formatter(lambda value, at: f"{value:g}" if f"{value:.0e}"[0] in "25" else "")
+    for axis in panels.flat[len(scenes) :]:
+        axis.set_axis_off()
+    figure.supxlabel("run time [s]", fontsize=9)
+    figure.supylabel("PSNR of the unseen motion [dB]", fontsize=9)
+    shown = [method for method in methods if method in keys]
+    figure.legend([keys[m] for m in shown], shown, loc="outside upper center", ncols=4, fontsize=8)
     return figure
 
 

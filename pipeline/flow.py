@@ -61,7 +61,7 @@ def plan(config: dict[str, Any], capture: Step, ask: bool = True, found: dict[st
     estimate = guess if "learn" in without else step("learn", capture, gaussians, body)
     trajectory = step("simulate", body, estimate)
     video = step("render", capture, gaussians, body, trajectory)
-    if _unknown(found) and not {"foretell", "learn"} & set(without):
+    if cause_unknown(found) and not {"foretell", "learn"} & set(without):
         step("foretell", capture, gaussians, body, estimate)
     if "evaluate" not in without:
         videos, estimates = {"learned": video}, {"learned": estimate}
@@ -93,7 +93,7 @@ def left_out(config: dict[str, Any], capture: dict[str, Any], shelf: Path) -> di
         why["learn"] = "the scene has no recorded motion to learn from, and the prior knows no other"
     if not roles:
         why["evaluate"] = "the scene has no recorded motion to compare with"
-    if _unknown(capture):
+    if cause_unknown(capture):
         why["evaluate"] = "nobody knows what set the recorded motion going: it is foretold instead"
     for name in why:
         usual = usual_seconds(shelf, name)
@@ -112,8 +112,8 @@ def _needs_clip(prior: dict[str, Any] | None) -> bool:
     return prior is None or bool(declared(prior["_target_"]).constants["needs_clip"])
 
 
-def _unknown(capture: dict[str, Any]) -> bool:
-    """Whether nobody knows what set the motion going that is learned from."""
+def cause_unknown(capture: dict[str, Any]) -> bool:
+    """Whether nobody knows what set the motion going that is learned from. `capture` is the stored Capture."""
     return any(take["role"] == "learn" and take.get("excitation", ()) is None for take in capture["takes"])
 
 

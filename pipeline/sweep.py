@@ -16,7 +16,6 @@ page. Exit codes: 0 all done, 1 a variant failed, 2 the command line is wrong, 1
 import csv
 import itertools
 import logging
-import os
 import queue
 import re
 import signal
@@ -32,6 +31,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+from physics3d.cores import usable
 from pipeline.__main__ import quiet, title
 from pipeline.flow import Plan, before, built, first, idle, plan, suit, up_to_date
 from pipeline.report import headline
@@ -150,7 +150,7 @@ def _crew(own: dict[str, str], most: int) -> Crew:
         raise SettingsError(f"address={where}: runner={runner} stays on this machine; take runner=dask, or no address")
     if where and not _is_address(where, runner):
         raise SettingsError(f"address={where} is none of a cluster; take address=tcp://<host>:<port>")
-    workers = own.get("workers") or str(min(most, os.cpu_count() or 1))
+    workers = own.get("workers") or str(min(most, usable()))
     if not re.fullmatch("[1-9][0-9]{0,3}", workers):
         raise SettingsError(f"workers is {workers!r}; take a number from 1 to 9999")
     return Crew(runner=runner, workers=int(workers), address=where)

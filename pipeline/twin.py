@@ -30,13 +30,13 @@ def write(environment: Mapping[str, str]) -> None:
         raise SettingsError("OUT is not given; make twin OUT=<new folder>")
 
     from physics3d.log import Log
-    from physics3d.scenes.carnation import CarnationTwin
+    from physics3d.scenes.carnation import DISTANCE, CarnationTwin
     from physics3d.scenes.handed_over import hand_over
 
     twin = CarnationTwin(views=40, frames=FRAMES, fps=FPS, push=PUSH, points=500, width=WIDTH, height=HEIGHT)
     with tempfile.TemporaryDirectory(prefix="physics3d_") as notes:
         thing = hand_over(twin(log=Log(Path(notes), name="twin")), folder, density=twin.density)
-    print(f"written   {thing}   the truth is in {folder / 'truth.yaml'}")
+    print(f"written   {thing}   photographed from {DISTANCE:g} m away, and the truth is in {folder / 'truth.yaml'}")
 
 
 if __name__ == "__main__":

@@ -2,8 +2,9 @@
 
 Of the take that was learned from the second half is foretold, of the others all that follows their first half second
 from the release on, in which only their start is sought. The prediction is by the modes of the body as the first take
-shows them (`learning/identify.py`); beside it stand still pictures, the image modes of what was seen, and the motion
-of the learned material alone, and of the material before it was learned, in modes that nothing has corrected.
+shows them (`learning/identify.py`); beside it stand still pictures, the image modes of what was seen, what was seen
+played again, which no motion that is fitted to it without physics can better, and the motion of the learned material
+alone, and of the material before it was learned, in modes that nothing has corrected.
 """
 
 import math
@@ -33,6 +34,7 @@ from physics3d.scenes.base import Capture, Take
 from physics3d.world import Estimate, World
 
 SEEN, LEARNED, START, IMAGE = "modes as seen", "learned material", "material before", "image modes"
+AGAIN = "what was seen, again"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +65,7 @@ class Foretell:
             log.metric(f"damping_{j}", float(swing.modes.damping[j]))
         motions: dict[str, Moving] = {SEEN: swing}
         for name, material in ((LEARNED, learned), (START, before)):
-            motions[name] = start(ready.reduced, material, window, reference=reference)[0]
+            motions[name] = start(ready.reduced, material, window, reference=reference, large=swing.large)[0]
         pose = {name: None if reference is None else motion.at(reference) for name, motion in motions.items()}
         if has_stopped(ready.sight, swing, flow, trusted, fps=take.fps, release=release):
             motions[SEEN] = _stopped(swing, take, notes, log)
@@ -106,7 +108,7 @@ class Foretell:
             swing = _stopped(swing, take, notes, log)
         motions: dict[str, Moving] = {SEEN: swing}
         for name, material in materials.items():
-            motions[name] = start(ready.reduced, material, window, known=known[name])[0]
+            motions[name] = start(ready.reduced, material, window, known=known[name], large=swing.large)[0]
         return self.judged(ready, take, motions, flow, release=release, seen=seen, notes=notes, log=log)
 
     def judged(
@@ -133,6 +135,7 @@ class Foretell:
             for name, motion in motions.items()
         }
         clips[IMAGE] = image_modes(frames[:seen], fps).frames(range(seen, len(frames)))
+        clips[AGAIN] = frames[release + np.arange(len(future)) % (seen - release)]
         clips |= stills(frames, seen=seen)
         measured = Reference(future, fps)
         found = {REFERENCE: _plain(measured.itself()[0], take.name, notes)}

@@ -32,6 +32,7 @@ from physics3d.learning.chain import chain_of
 from physics3d.learning.course import Point, history
 from physics3d.learning.curves import curves
 from physics3d.learning.fields import AXES, AbstractField, GlobalField, physical
+from physics3d.learning.film_next import film_next
 from physics3d.learning.fit import fit
 from physics3d.learning.imagined import Imagined
 from physics3d.learning.interval import Beyond, Told, intervals, is_stiff, of_branches, posterior, told, words
@@ -45,7 +46,7 @@ from physics3d.learning.search import search
 from physics3d.learning.stiffness_field import WIDTH, StiffnessField, asked_for, is_node, picture, smooth, trilinear
 from physics3d.learning.unknown_cause import learned_free
 from physics3d.learning.valley import reaches
-from physics3d.learning.which_model import compared, film_next, other_end
+from physics3d.learning.which_model import compared, other_end
 from physics3d.log import Log
 from physics3d.pictures import contact_sheet, titled, to_uint8
 from physics3d.priors.base import AbstractPrior
@@ -59,6 +60,7 @@ Span = Annotated[float, Gt(1), Le(1e12)]  # a factor
 Width = Annotated[float, Gt(0), Le(20)]
 USUAL_FRAMES = 15  # of a clip, for priors that take any number
 USUAL_STEPS = 15  # of gradient descent, where nothing is polished
+SOFTER = 4.0  # than what the search found: a thing that a wall stopped looks as much stiffer where walls are not felt
 LOOKS = 2  # along the valley: a lower place is polished once, and looked around from again
 
 
@@ -150,9 +152,11 @@ class Learn:
         seconds = int(indices[-1]) / take.fps
         whole = self.field(start, speed=self.natural_speed(body, seconds))
 
-        def chained(field: AbstractField, log: Log) -> Chain:
+        world = self.world
+
+        def chained(field: AbstractField, log: Log, world: World) -> Chain:
             return chain_of(
-                self.world,
+                world,
                 self.prior,
                 self.estimator,
                 field,
@@ -166,9 +170,7 @@ class Learn:
                 log=log,
             )
 
-        chain = chained(whole, log)
-        if chain.on_grid and self.world.solver == "auto":  # otherwise said already
-            say_resolution(section, self.world.dx, log)
+        chain = chained(whole, log, world)
         trained = self.prior.trained_frames
         if trained not in (None, len(indices)):
             log.warn(f"{len(indices)} frames are shown to a prior that was trained on clips of {trained}")
@@ -180,6 +182,13 @@ class Learn:
         course: list[Point] = []
         if self.search:
             theta, course = self.searched(chain, whole, log)
+        if chain.passes_a_wall(whole.bound(theta - math.log(SOFTER) * stiffer(whole))):
+            log.info(f"{SOFTER:g} times as soft as found without walls it reaches one, so what was filmed may have")
+            world = replace(world, solver="grid")
+            chain = replace(chained(whole, log, world), journal=chain.journal)
+            theta, course = self.searched(chain, whole, log) if self.search else (whole.zero(), [])
+        if chain.on_grid and self.world.solver == "auto":  # otherwise said already
+            say_resolution(section, self.world.dx, log)
         polished = self.polish > 0 and chain.comparable
         steps = self.steps
         if steps is None:
@@ -212,7 +221,7 @@ class Learn:
             log.info("no field of stiffness: residuals tell whether a clip asks for one, and this prior has none")
         elif varying is not None and seen is not None:
             finer = StiffnessField(whole=whole, weights=varying)
-            over, more = replace(chained(finer, Log(None)), journal=chain.journal), finer.zero()
+            over, more = replace(chained(finer, Log(None), world), journal=chain.journal), finer.zero()
             more[: len(theta)] = theta
             more, descent = self.descended(over, finer, more, self.steps or USUAL_STEPS, log)
             if polished:
@@ -395,7 +404,7 @@ class Learn:
 
     def searched(self, chain: Chain, field: GlobalField, log: Log) -> tuple[Tensor, list[Point]]:
         """The best of the factors on all moduli together; the start if no modulus is learned, which is said."""
-        directions = torch.tensor([float(name.split("+")[0].endswith("modulus")) for name in field.names]).double()
+        directions = stiffer(field)
         if not directions.any():
             log.info(f"no coarse search over the stiffness: no modulus is learned, only {', '.join(field.names)}")
             return field.zero(), []
@@ -462,3 +471,8 @@ class Learn:
             log.metric(f"interval/{name}/low", one.low)
             log.metric(f"interval/{name}/high", one.high)
             log.metric(f"interval/{name}/deviation", one.deviation)
+
+
+def stiffer(field: GlobalField) -> Tensor:
+    """The direction [k] of all moduli together; zero if none is learned."""
+    return torch.tensor([float(name.split("+")[0].endswith("modulus")) for name in field.names]).double()

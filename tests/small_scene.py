@@ -2,6 +2,7 @@
 
 import torch
 
+from physics3d.boundaries.base import AbstractBoundary
 from physics3d.boundaries.fixed_region import FixedRegion
 from physics3d.boundaries.impulse import Impulse
 from physics3d.filling.body import Body
@@ -30,14 +31,20 @@ DX = 0.05
 POKE = (Impulse(force=(1.2, 0.0, 0.0), centre=(0.0, 0.0, 0.4), radius=0.12, start=0.0, duration=0.1),)
 
 
-def world(start: dict[str, float], precision: str = "float32", solver: str = "grid") -> World:
+def world(
+    start: dict[str, float],
+    precision: str = "float32",
+    solver: str = "grid",
+    boundaries: tuple[AbstractBoundary, ...] = (),
+) -> World:
+    """Its foot is held; `boundaries` besides."""
     return World(
         material=Viscoelastic(branches=1 if "branch_shear_modulus" in start else 0),
         density=300.0,
         start=start,
         dx=DX,
         gravity=(0.0, 0.0, 0.0),
-        boundaries=(FixedRegion(lower=(-1.0, -1.0, -1.0), upper=(1.0, 1.0, 0.06)),),
+        boundaries=(FixedRegion(lower=(-1.0, -1.0, -1.0), upper=(1.0, 1.0, 0.06)), *boundaries),
         precision=precision,
         solver=solver,
     )
@@ -102,7 +109,14 @@ def bar_chain(world: World, field: GlobalField, clip: Capture, frames: int) -> C
 
 
 def capture(
-    truth: dict[str, float], *, frames: int = 10, fps: float = 20.0, views: int = 1, held_out=(), solver: str = "grid"
+    truth: dict[str, float],
+    *,
+    frames: int = 10,
+    fps: float = 20.0,
+    views: int = 1,
+    held_out=(),
+    solver: str = "grid",
+    boundaries: tuple[AbstractBoundary, ...] = (),
 ) -> Capture:
     """Clips rendered by the code under test, with the true parameters."""
     gaussians, _ = bar()
@@ -112,7 +126,7 @@ def capture(
     )
     empty = Capture(name="bar", images=(), cameras=(), names=(), gaussians=gaussians, takes=(take,), truth=truth)
     field = GlobalField(start=world(truth).estimate().parameters, learn=("youngs_modulus",))
-    chain = bar_chain(world(truth, solver=solver), field, empty, frames)
+    chain = bar_chain(world(truth, solver=solver, boundaries=boundaries), field, empty, frames)
     with torch.no_grad():
         motion = chain.simulate(field.zero())
         videos = [chain.render(motion, view, torch.arange(frames)) for view in range(views)]

@@ -8,6 +8,7 @@ from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
+import yaml
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("physics3d", "stages", "pipeline")
@@ -85,6 +86,30 @@ def test_no_library_takes_the_signal_that_ends_a_run():
     pytest.importorskip("pycolmap")
     done = subprocess.run([sys.executable, "-c", TERMINATE], cwd=ROOT, capture_output=True, text=True)
     assert done.stdout.endswith("interrupted\n") and not done.returncode, done.stderr
+
+
+USUAL = """
+import sys
+from pipeline.flow import built
+from pipeline.settings import compose
+built(compose(["device=cpu"])[0], "cpu")
+print(*sys.modules)
+"""
+
+
+def test_a_video_model_that_is_not_asked_is_not_imported():
+    """Every stage of the default run is built; of all priors its own alone is there, and no library of such models."""
+    priors = {path.stem: declared["_target_"] for path, declared in configurations("prior")}
+    done = subprocess.run([sys.executable, "-c", USUAL], cwd=ROOT, capture_output=True, text=True)
+    assert not done.returncode, done.stderr
+    there = set(done.stdout.split())
+    modules = {name: target.rpartition(".")[0] for name, target in priors.items()}
+    assert {name for name, module in modules.items() if module in there} == {"exemplar"}
+    assert not {"diffusers", "transformers", "huggingface_hub"} & there
+
+
+def configurations(group: str) -> list[tuple[Path, dict]]:
+    return [(path, yaml.safe_load(path.read_text())) for path in sorted((ROOT / "conf" / group).glob("*.yaml"))]
 
 
 def imported_at_the_top(path: Path) -> set[str]:

@@ -1,5 +1,7 @@
 """Where a body is attached: the particles beside Gaussians that do not move (a stem in its soil)."""
 
+import math
+
 import numpy as np
 import torch
 from scipy.spatial import Delaunay, cKDTree
@@ -10,6 +12,7 @@ from physics3d.gaussians.model import Gaussians
 from physics3d.log import Log
 
 CONTACT = (0.6, 1.0)  # particles nearer to a static Gaussian are held by it; at most, where none is so near [spacings]
+FLAT = 1 / 3  # of its width: what is no thicker is one layer, the wall of a pot around its soil as well
 SPECK = 0.05  # static clusters of less than this share are mistakes of the segmentation and hold nothing
 
 
@@ -51,15 +54,21 @@ def attached_particles(
 
 
 def within_outline(position: np.ndarray, patch: np.ndarray, spacing: float) -> np.ndarray:
-    """Bool [p]: inside the convex outline of a flat patch [k, 3], in its own layer; of no use where it is not flat."""
+    """Bool [p]: inside the convex outline of a flat patch [k, 3], in its own layer; of no use where it is not flat.
+
+    The layer is the slab whose second moment is the patch's: one particle of a hundred that touches the rim of a pot
+    above the soil, or a leaf's tip that lies on it, does not raise what holds the stem."""
+    if len(patch) < 4:
+        return np.zeros(len(position), bool)
     centre = patch.mean(0)
     _, size, axes = np.linalg.svd(patch - centre, full_matrices=False)
-    if len(patch) < 4 or size[2] > spacing * np.sqrt(len(patch)) or size[1] < 1e-3 * size[0]:
+    thin = size[2] <= max(spacing * np.sqrt(len(patch)), FLAT * size[1])
+    if not thin or size[1] < 1e-3 * size[0]:
         return np.zeros(len(position), bool)
     local, all_of_them = (patch - centre) @ axes.T, (position - centre) @ axes.T
     inside = Delaunay(local[:, :2]).find_simplex(all_of_them[:, :2]) >= 0
-    low, high = local[:, 2].min() - spacing / 4, local[:, 2].max() + spacing / 4
-    return inside & (all_of_them[:, 2] >= low) & (all_of_them[:, 2] <= high)
+    half = math.sqrt(3 * (local[:, 2] ** 2).mean()) + spacing / 4
+    return inside & (np.abs(all_of_them[:, 2]) <= half)
 
 
 def not_specks(point: np.ndarray, size: float) -> np.ndarray:

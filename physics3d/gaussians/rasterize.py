@@ -31,6 +31,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from physics3d.artifact import require_finite
+from physics3d.cores import usable
 from physics3d.gaussians.cameras import Camera
 from physics3d.gaussians.model import Gaussians
 from physics3d.gaussians.splat import ENTRIES, Numerics
@@ -220,14 +221,10 @@ def _view(made: Kernels, camera: Camera, antialiased: bool, numerics: Numerics, 
     return view
 
 
-def _cores() -> int:
-    return len(os.sched_getaffinity(0))
-
-
 def _equal_shares(n: int, device: torch.device) -> list[tuple[int, int]]:
     if device.type == "cuda" or n < FEW:
         return [(0, n)]
-    cores = _cores()
+    cores = usable()
     return list(pairwise(n * i // cores for i in range(cores + 1)))
 
 
@@ -236,7 +233,7 @@ def _tile_shares(state: _State) -> list[tuple[int, int]]:
     tiles = len(state.start) - 1
     if state.mean.is_cuda:
         return [(0, tiles * state.tile**2)]
-    cores = min(_cores(), tiles)
+    cores = min(usable(), tiles)
     work = state.start + 8 * torch.arange(tiles + 1)
     cuts = torch.searchsorted(work, torch.arange(1, cores) * int(work[-1]) // cores).tolist()
     return list(pairwise([0, *cuts, tiles]))
@@ -266,7 +263,7 @@ def _loaded(kernel: wp.Kernel, device: str):
 @cache
 def _pool(process: int) -> ThreadPoolExecutor:
     """Threads of this process (a forked one has none of its parent's)."""
-    return ThreadPoolExecutor(_cores(), thread_name_prefix="splat")
+    return ThreadPoolExecutor(usable(), thread_name_prefix="splat")
 
 
 def _blend(state: _State, background: Tensor) -> list[Tensor]:

@@ -15,8 +15,8 @@ from physics3d.gaussians.deform import Backdrop, render_deformed
 from physics3d.gaussians.model import Gaussians
 from physics3d.journal import Journal
 from physics3d.learning.fields import AbstractField
+from physics3d.learning.film_next import recordings
 from physics3d.learning.loss import Chain
-from physics3d.learning.which_model import recordings
 from physics3d.log import Log
 from physics3d.priors.base import AbstractPrior
 from physics3d.priors.estimators.base import AbstractEstimator
@@ -45,7 +45,10 @@ def chain_of(
 ) -> Chain:
     """Of the frames `indices`, ascending from 0, of the cameras of the take that are not held out.
 
-    Pictures are drawn at `image_scale` of the take's size. Raises ValueError if all cameras are held out.
+    Pictures are drawn at `image_scale` of the take's size. Where modes serve the body, they move it whatever theta is,
+    through walls that they do not feel: trials that one solver moves and then the other have steps in their loss, and
+    cost the time of both. `Chain.passes_a_wall` tells where that is wrong. Raises ValueError if all cameras are held
+    out.
     """
     rest, volume = body.position.to(device), body.volume.to(device)
     clips, draw = filmed(capture, gaussians, body, take, indices, image_scale=image_scale, device=device)
@@ -56,8 +59,8 @@ def chain_of(
     part = lambda values: world.material.per_part(values, body.part, body.parts)
     first = part(field.parameters(field.zero()))
 
-    def moved(excitation: tuple[AbstractBoundary, ...], timing: dict[str, Any], log: Log) -> Motion:
-        motion = motion_of(
+    def moved(excitation: tuple[AbstractBoundary, ...], log: Log) -> Motion:
+        found = motion_of(
             world,
             rest,
             volume,
@@ -67,10 +70,10 @@ def chain_of(
             device=device,
             log=log,
         )
-        return motion.settled(first, velocity=field.velocity(field.zero()), **timing)
+        return replace(found, feels_walls=False)
 
     timing: dict[str, Any] = dict(frames=at[-1] + 1, frame_dt=step / take.fps)
-    motion = moved(take.excitation or (), timing, log)
+    motion = moved(take.excitation or (), log)
     motion.report(first)
 
     def simulate(theta: Tensor):
@@ -93,7 +96,7 @@ def chain_of(
     def staged(excitation: tuple[AbstractBoundary, ...], times: float):
         def made():
             slower = timing | dict(frame_dt=times * timing["frame_dt"])
-            other = motion if excitation == take.excitation else moved(excitation, slower, Log(None))
+            other = motion if excitation == take.excitation else moved(excitation, Log(None))
             return lambda theta: other(
                 part(field.parameters(theta)), velocity=field.velocity(theta), log=Log(None), **slower
             )
@@ -112,6 +115,9 @@ def chain_of(
         estimator=estimator,
         pushed=pushed if forced else None,
         recordings={name: staged(excitation, times) for name, (excitation, times) in others.items()},
+        passes_a_wall=lambda theta: motion.passes_a_wall(
+            part(field.parameters(theta)), velocity=field.velocity(theta), **timing
+        ),
         on_grid=motion.modes is None,
         journal=Journal(log),
     )

@@ -19,6 +19,7 @@ from jaxtyping import Float
 
 from physics3d.learning.free_motion import LIKELY, WIDTH, Material, Reduced, start, swinging
 from physics3d.learning.interval import Beyond, Posterior, log_normal, posterior, told
+from physics3d.learning.large_swing import SMALL, LargeSwing
 from physics3d.learning.sandwich import Evidence, blocks, correlation_length
 from physics3d.learning.seen_modes import Observed, Sight
 from physics3d.log import Log
@@ -36,6 +37,7 @@ def free_posterior(
     flow: Float[np.ndarray, "t n 2"],
     weight: Float[np.ndarray, "t n"],
     reference: float | None,
+    large: LargeSwing = SMALL,
     width: float,
     beyond: Beyond,
     log: Log,
@@ -49,14 +51,14 @@ def free_posterior(
     def course(values: np.ndarray) -> tuple[Float[np.ndarray, "t m"], Material]:
         """(what the flow shows of the best motion with these numbers, the material of these)."""
         one = Material.of(values if zones else np.concatenate([values, material.zones]))
-        motion, _ = start(body, one, clip, reference=reference)
+        motion, _ = start(body, one, clip, reference=reference, large=large)
         q = np.stack([motion.at(i / clip.fps) for i in range(len(clip.gram))])
         return (q if reference is None else q - motion.at(reference)), one
 
     here, best = course(theta)
     sides = [[course(theta + side * STEP * e)[0] for side in (1, -1)] for e in np.eye(len(theta))]
     change = np.stack([(up - down) / (2 * STEP) for up, down in sides], -1)
-    swing = swinging(body, best, clip, reference=reference)
+    swing = swinging(body, best, clip, reference=reference, large=large)
     basis = np.einsum("mk,akt->tmak", swing.shape, swing.functions).reshape(*here.shape, -1)
     weighed = np.einsum("tmn,tnx->tmx", clip.gram, change)
     amplitude = np.linalg.solve(

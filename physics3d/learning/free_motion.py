@@ -10,6 +10,7 @@ every mode has three roots s: an oscillation, and the creep of its dash-pot. The
 
     q(t) = sum_k phi_k (a_k e^(-d_k t) cos 2 pi f_k t + b_k e^(-d_k t) sin 2 pi f_k t + c_k e^(-r_k t))
 
+but for what large swings do to the two of an oscillation (`large_swing.py`): the material is that of small ones.
 Against the flow (`seen_modes.py`) the a, b, c are linear least squares, solved inside for any material (variable
 projection, Golub and Pereyra 1973); a mode that a camera hardly sees is held near zero by a hundredth of what its
 motion in space would cost if it were seen, and more by as much as its energy is above that of the mode seen most. That
@@ -29,6 +30,7 @@ from jaxtyping import Float, Int
 from scipy import optimize
 
 from physics3d.journal import Journal
+from physics3d.learning.large_swing import SMALL, LargeSwing
 from physics3d.learning.seen_modes import Observed
 from physics3d.log import Log
 from physics3d.modes import vibration
@@ -89,17 +91,19 @@ class FreeMotion:
     slow: Float[np.ndarray, " k"]  # c_k
     unexplained: float  # share of the motion
     loudness: Float[np.ndarray, " k"]  # rms of each mode when seen [px]
+    large: LargeSwing
 
     def at(self, t: float) -> Float[np.ndarray, " m"]:
         """Amplitudes at time t [s]."""
-        one, two, three = time_functions(self.frequency, self.damping, self.creep, np.array([t]))[..., 0]
+        one, two, three = time_functions(self.frequency, self.damping, self.creep, self.large, np.array([t]))[..., 0]
         return self.shape @ (self.cosine * one + self.sine * two + self.slow * three)
 
 
-def time_functions(f: np.ndarray, d: np.ndarray, r: np.ndarray, t: np.ndarray) -> Float[np.ndarray, "3 k t"]:
+def time_functions(
+    f: np.ndarray, d: np.ndarray, r: np.ndarray, large: LargeSwing, t: np.ndarray
+) -> Float[np.ndarray, "3 k t"]:
     """The three functions of time of every mode."""
-    fall, angle = np.exp(-d[:, None] * t), 2 * np.pi * f[:, None] * t
-    return np.stack([fall * np.cos(angle), fall * np.sin(angle), np.exp(-np.minimum(r[:, None] * t, 60.0))])
+    return np.concatenate([large.functions(f, d, t), np.exp(-np.minimum(r[:, None] * t, 60.0))[None]])
 
 
 def roots(
@@ -154,15 +158,17 @@ def swinging(
     *,
     known: Float[np.ndarray, " m"] | None = None,
     reference: float | None = None,
+    large: LargeSwing = SMALL,
 ) -> Swinging:
     """As `start`."""
     square, shape = modal(body, material)
     f, d, r = roots(square, math.exp(material.ratio), math.exp(material.time))
     t = np.arange(len(clip.gram)) / clip.fps
-    functions = time_functions(f, d, r, t)
+    functions = time_functions(f, d, r, large, t)
     size = functions**2 @ clip.weight  # of a motion over the frames, whichever of them the flow counts from
+    size = np.maximum(size, 1e-9 * size.max())  # what creeps without swinging has no sine
     if reference is not None:
-        functions = functions - time_functions(f, d, r, np.array([reference]))
+        functions = functions - time_functions(f, d, r, large, np.array([reference]))
     G = np.einsum("mk,tmn,nl->tkl", shape, clip.gram, shape, optimize=True)
     b, square_sum = clip.right, clip.square
     if known is not None:  # u + J q_0 is what the motion has to explain
@@ -194,12 +200,13 @@ def start(
     *,
     known: Float[np.ndarray, " m"] | None = None,
     reference: float | None = None,
+    large: LargeSwing = SMALL,
 ) -> tuple[FreeMotion, float]:
     """(the motion that fits a clip best, its cost [px^2]). Time 0 is the first frame of the clip.
 
     The flow counts from the frame at time `reference` [s], or from a picture of which the amplitudes `known` are given.
     """
-    swing = swinging(body, material, clip, known=known, reference=reference)
+    swing = swinging(body, material, clip, known=known, reference=reference, large=large)
     x = np.linalg.solve(swing.normal + np.diag(swing.ridge), swing.right)
     left = float(swing.square - 2 * x @ swing.right + x @ swing.normal @ x)
     a, s, c = x.reshape(3, -1)
@@ -216,17 +223,25 @@ def start(
         slow=c,
         unexplained=left / max(swing.square, 1e-30),
         loudness=loudness,
+        large=large,
     )
     return motion, left + float(x @ (swing.ridge * x))
 
 
 def fit(
-    body: Reduced, clip: Observed, *, release: int, reference: int | None, frequency: float, log: Log
+    body: Reduced,
+    clip: Observed,
+    *,
+    release: int,
+    reference: int | None,
+    frequency: float,
+    large: LargeSwing = SMALL,
+    log: Log,
 ) -> tuple[Material, FreeMotion]:
     """The material that explains frames from `release` on, and the motion, whose time 0 is that frame.
 
-    `frequency`: of the clip's largest oscillation [Hz]; `reference`: the frame that the flow counts from; None: a
-    picture of the body at rest.
+    `frequency`: of the clip's largest oscillation, of small swings [Hz]; `reference`: the frame that the flow counts
+    from; None: a picture of the body at rest.
     """
     window, zones = clip.window(release, len(clip.gram)), len(body.zones)
     at = None if reference is None else (reference - release) / clip.fps
@@ -238,7 +253,7 @@ def fit(
         material = Material.of(theta)
         if not np.all(np.abs(theta) < 40):
             return 1e3
-        misfit = lambda: float(start(body, material, window, reference=at)[1]) / moved
+        misfit = lambda: float(start(body, material, window, reference=at, large=large)[1]) / moved
         tried.update()
         return journal.ask("misfit", theta.tolist(), answer=misfit) + PRIOR * material.improbability()
 
@@ -278,7 +293,7 @@ def fit(
     # told one way: zones are zero in the mean
     theta[0], theta[3:] = theta[0] + theta[3:].mean(), theta[3:] - theta[3:].mean()
     material = Material.of(theta)
-    return material, start(body, material, window, reference=at)[0]
+    return material, start(body, material, window, reference=at, large=large)[0]
 
 
 def _descended(cost, first: np.ndarray, evaluations: int) -> optimize.OptimizeResult:

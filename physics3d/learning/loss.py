@@ -43,6 +43,7 @@ class Chain:
     pushed: Callable[[Tensor, float], Any] | None = None
     # what could be filmed next, in words -> what makes its motions by theta, of as many frames; takes time when called
     recordings: Mapping[str, Callable[[], Callable[[Tensor], Any]]] = field(default_factory=dict)
+    passes_a_wall: Callable[[Tensor], bool] = lambda theta: False  # that `simulate` does not feel
     on_grid: bool = True  # whether a grid moves the body, whose resolution a stiffness then hangs on
     journal: Journal = field(default_factory=lambda: Journal(Log(None)))
 
@@ -94,12 +95,18 @@ class Chain:
         """The denoising loss over all views and frames, always with the same noise."""
         return self.journal.ask("measure", theta, seed, answer=lambda: self._measured(theta, seed))
 
-    def _measured(self, theta: Tensor, seed: int) -> float:
+    def still(self, theta: Tensor, seed: int) -> float:
+        """What `measure` is of the first picture of the motion, standing still."""
+        return self.journal.ask("still", theta, seed, answer=lambda: self._measured(theta, seed, 0 * self.frames))
+
+    def _measured(self, theta: Tensor, seed: int, drawn: Tensor | None = None) -> float:
+        """`drawn`: the frames that are drawn in the place of all."""
         generator, total, pixels = torch.Generator().manual_seed(seed), 0.0, 0
         with torch.no_grad():
             motion = self.simulate(theta)
             for view in self.clips:
-                video, condition = self.render(motion, view, self.frames), self.condition(view, self.frames)
+                video = self.render(motion, view, self.frames if drawn is None else drawn)
+                condition = self.condition(view, self.frames)
                 total += denoising_loss(self.prior, video, condition, generator=generator)
                 pixels += video.numel()
         return total / pixels

@@ -6,8 +6,10 @@ A branch of modulus m and time tau beside a spring E answers a swing of angular 
 
 For every x there are E and m with the same S and D; x and 1/x even share m. So a clip of one frequency tells them
 apart only by how the thing gives way to a steady force and by how its decay begins, and a descent stays in the valley
-in which it began. It is begun once more from the other side, at 1/x, or, where x is about 1, at 3 x or x/3; the better
-end is taken (of linear viscoelastic solids: Ferry 1980, Viscoelastic Properties of Polymers, ch. 3).
+in which it began. It is begun once more: from the other side, at 1/x, or, where the sides are far apart, from between
+them, at x = 1, where a branch damps most; where x is about 1, at 3 x or x/3. Of two places the one with the lower loss
+is taken, and of two ends the better one (of linear viscoelastic solids: Ferry 1980, Viscoelastic Properties of
+Polymers, ch. 3).
 """
 
 import math
@@ -22,7 +24,7 @@ from physics3d.trajectory import Trajectory
 
 NAMES = ("youngs_modulus", "branch_shear_modulus", "shear_relaxation_time")
 NEAR = 1.6  # x or 1/x up to which both sides are one, and a factor between times that are
-AWAY = 3.0  # then so far to either side
+AWAY = 3.0  # then so far to either side; sides of which each is as far from 1 have a middle
 LEAST = 0.1  # of E, that is left of it
 
 
@@ -51,8 +53,8 @@ def across(field: GlobalField, theta: Float[Tensor, " k"], omega: float) -> list
     x = omega * values["shear_relaxation_time"]
     if not x > 0:
         return []
-    found = []
-    for factor in (AWAY, 1 / AWAY) if max(x, 1 / x) < NEAR else (x**-2,):
+    found, far = [], max(x, 1 / x)
+    for factor in (AWAY, 1 / AWAY) if far < NEAR else (x**-2,) if far < AWAY else (x**-2, 1 / x):
         E, m = of_same_swing(*moduli, x, factor * x)
         there = theta.clone()
         there[spring] += math.log(max(E / moduli[0], LEAST))

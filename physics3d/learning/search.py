@@ -3,10 +3,13 @@
 Offsets are tried along a line, equally far apart. Where the lowest loss is at an end, the line goes on from there by
 the same step, so that a start which is a factor 100 off is found as one that is a factor 2 off; it ends at the span of
 the field. Between the best and its neighbours the middles are tried as well, for of two places to either side of the
-best valley one may lie in another. A second valley that is nearly as deep is said: then the clip, as far as the search
+best valley one may lie in another. A valley is the narrower the more swings a clip shows: where the best that was tried
+explains little more than a picture that stands still, all of the line is looked at again between what was tried, and
+beyond its ends, once or twice. A second valley that is nearly as deep is said: then the clip, as far as the search
 sees, has two answers.
 """
 
+import itertools
 import math
 
 from torch import Tensor
@@ -16,6 +19,8 @@ from physics3d.learning.fields import GlobalField
 from physics3d.learning.loss import Chain
 from physics3d.log import Log
 
+DEEP = 0.75  # of the loss of a picture that stands still: below it something is explained
+FINE = 0.2  # between neighbours that are looked at, in the logarithm: a tenth of a frequency
 NEARLY = 1.5  # as deep: so many times the lowest loss, as of two answers that a descent may still exchange
 
 
@@ -37,7 +42,8 @@ def search(
     for offset in log.progress(offsets, "coarse search"):
         measure(offset)
     step, limit = offsets[1] - offsets[0], math.log(field.span) + 1e-9
-    best = min(tried, key=lambda offset: tried[offset].loss)
+    lowest = lambda: min(tried, key=lambda offset: tried[offset].loss)
+    best = lowest()
     while (side := (best == max(tried)) - (best == min(tried))) and abs(best + side * step) <= limit:
         log.info(f"x{math.exp(best):.3g} is the best so far and the last that was tried: going on")
         measure(best + side * step)
@@ -48,7 +54,17 @@ def search(
     for side in (-1, 1):
         if abs(best + side * step / 2) <= limit:
             measure(best + side * step / 2)
-    best = min(tried, key=lambda offset: tried[offset].loss)
+    best, width, still = lowest(), step, chain.still(field.zero(), seed)
+    while tried[best].loss > DEEP * still and step > FINE:
+        log.info("nothing tried explains much more than a picture that stands still: looking between and beyond")
+        ends = (min(tried), -1), (max(tried), 1)
+        beyond = [end + side * times * width for end, side in ends for times in (1, 2)]
+        places = [offset for offset in beyond if abs(offset) <= limit]
+        places += [(low + high) / 2 for low, high in itertools.pairwise(sorted([*tried, *places]))]
+        for offset in log.progress([place for place in places if place not in tried], "finer search"):
+            measure(offset)
+        best, step = lowest(), step / 2
+        others = [other for other in valleys(tried) if other != best]
     table = ", ".join(f"x{math.exp(offset):.3g}: {tried[offset].loss:.4g}" for offset in sorted(tried))
     log.info(f"coarse search over the stiffness ({table}): start at x{math.exp(best):.3g}")
     if others:

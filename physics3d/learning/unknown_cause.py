@@ -14,6 +14,7 @@ from physics3d.gaussians.register import register
 from physics3d.learning.free_body import estimate, reduced
 from physics3d.learning.free_interval import free_intervals, free_posterior
 from physics3d.learning.free_motion import FreeMotion, Material, Reduced, fit
+from physics3d.learning.identify import identified
 from physics3d.learning.interval import Beyond
 from physics3d.learning.seen_modes import Observed, Sight, observe, sight
 from physics3d.log import Log
@@ -141,22 +142,30 @@ def learned_free(
     logarithm; `beyond`: what the frames do not show."""
     ready = swung(world, capture, gaussians, body, zones=zones, log=log)
     clip, u, trusted, decay, release = first_take(ready, log)
-    main = decay.main()
-    assert main is not None and ready.take.posed is not None
+    assert ready.take.posed is not None
     reference = None if ready.take.at_rest else ready.take.posed
+    window, at = clip.window(release, len(clip.gram)), None if reference is None else (reference - release) / clip.fps
+    swing = identified(ready.reduced, window, decay, reference=at, log=log)
     material, motion = fit(
-        ready.reduced, clip, release=release, reference=reference, frequency=float(decay.frequency[main]), log=log
+        ready.reduced,
+        clip,
+        release=release,
+        reference=reference,
+        frequency=float(swing.modes.frequency[0]),
+        large=swing.large,
+        log=log,
     )
     report(motion, material, log)
     i, j = ready.sight.pixel.T
     after = free_posterior(
         ready.reduced,
         material,
-        clip.window(release, len(clip.gram)),
+        window,
         sight=ready.sight,
         flow=u[release:, i, j].astype(float),
         weight=trusted[release:],
-        reference=None if reference is None else (reference - release) / clip.fps,
+        reference=at,
+        large=swing.large,
         width=width,
         beyond=beyond,
         log=log,

@@ -1,6 +1,5 @@
 """The body on its device as the solver sees it, and the arrays and kernels made for it and its boundaries."""
 
-import os
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,6 +8,7 @@ import warp as wp
 from torch import Tensor
 
 from physics3d.boundaries.base import mirror_nodes
+from physics3d.cores import usable
 from physics3d.mpm.arrays import Arrays
 from physics3d.mpm.hooks import Hooks, hooks_of
 from physics3d.mpm.problem import Problem
@@ -56,7 +56,7 @@ def make_body(problem: Problem, coefficients: Tensor, q: Tensor, position: Tenso
     hooks = hooks_of(problem.boundaries, problem.widths, real)
     threads = problem.threads
     if threads is None:
-        threads = min(os.cpu_count() or 1, 8, 1 + len(position) // 4000)
+        threads = min(usable(), 8, 1 + len(position) // 4000)
     arrays = Arrays(
         dx=world.dx,
         origin=setting.lower,

@@ -18,7 +18,6 @@ from functools import cache
 
 import warp as wp
 
-
 SPARE = 3  # elements of arrays on the nodes that are read, and written as they are, behind the last one
 
 

@@ -103,7 +103,7 @@ def _have_all_come(w: int, workers: int, come: int, came: wp.array2d(dtype=int))
 def _meet(
     # in
     w: int,  # worker
-    workers: int,
+    workers: int,  # how many
     come: int,  # 1: it comes; 0: it only looks again
     came: wp.array2d(dtype=int),  # [worker, 16] how often
     # out

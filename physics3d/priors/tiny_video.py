@@ -67,6 +67,13 @@ class TinyVideo(AbstractPrior):
         """Of a clip that the network takes, neither more nor fewer."""
         return self.architecture.frames
 
+    def require_frames(self, frames: int) -> None:
+        if frames != self.trained_frames:
+            raise ValueError(
+                f"learn.frames is {frames}; tiny_video knows clips of {self.trained_frames} frames and no others: set "
+                f"learn.frames={self.trained_frames}"
+            )
+
     @cached_property
     def network(self) -> SpaceTimeTransformer:
         return load(self.folder).to(self.device)
@@ -74,15 +81,11 @@ class TinyVideo(AbstractPrior):
     def condition(
         self, first: Float[Tensor, "h w 3"], clips: tuple[Float[Tensor, "t h w 3"], ...]
     ) -> Float[Tensor, "3 H W"]:
-        """The first frame as a code; recorded clips are not used. Raises ValueError if it is not square."""
+        """The first frame as a code; recorded clips are not used."""
         return self._small(first[None])[0].to(self.device)
 
     def encode(self, video: Float[Tensor, "t h w 3"]) -> Float[Tensor, "t 3 H W"]:
-        if len(video) != self.trained_frames:
-            raise ValueError(
-                f"the clip has {len(video)} frames; tiny_video knows clips of {self.trained_frames}: set "
-                f"learn.frames={self.trained_frames}"
-            )
+        self.require_frames(len(video))
         return self._small(video)
 
     def level(self, share: float) -> Level:
@@ -96,16 +99,12 @@ class TinyVideo(AbstractPrior):
         return found[0].to(z_t)
 
     def _small(self, video: Float[Tensor, "t h w 3"]) -> Float[Tensor, "t 3 H W"]:
-        """At the network's size, colours in -1..1."""
+        """The square in the middle, at the network's size, colours in -1..1."""
         height, width = video.shape[1:3]
-        if height != width:
-            raise ValueError(
-                f"the video is {width} x {height} px; tiny_video was trained on square pictures: crop it, or take "
-                "another prior"
-            )
-        size = self.architecture.size
-        frames = video.permute(0, 3, 1, 2)
-        if height != size:
+        side, size = min(height, width), self.architecture.size
+        top, left = (height - side) // 2, (width - side) // 2
+        frames = video[:, top : top + side, left : left + side].permute(0, 3, 1, 2)
+        if side != size:
             frames = torch.nn.functional.interpolate(
                 frames, (size, size), mode="bilinear", antialias=True, align_corners=False
             )

@@ -10,6 +10,7 @@ from fillings import SPACING, filled
 
 from physics3d.boundaries.fixed_region import FixedRegion
 from physics3d.boundaries.impulse import Impulse
+from physics3d.filling.attachment import within_outline
 from physics3d.log import Log
 from physics3d.materials.neo_hookean import NeoHookean
 from physics3d.mpm.rollout import rollout
@@ -50,6 +51,20 @@ def test_a_body_is_held_where_it_touches_what_is_static(speck):
     assert filled(gaussians, label=label).attached is None
     alone = filled(gaussians.select(label > 0), attach=True)
     assert not bool(alone.attached.any()) and alone.held == ()
+
+
+@pytest.mark.parametrize("layers", [1, 2, 4])
+@pytest.mark.parametrize("strays", [0, 2])
+def test_what_touches_above_the_layer_does_not_raise_it(layers, strays):
+    """A stem through a disc of soil, held at its rim by the pot; a crumb or two that touch the pot's edge above it."""
+    side = np.arange(-6, 7)
+    lattice = SPACING * np.stack(np.meshgrid(side, side, np.arange(layers + 8), indexing="ij"), -1).reshape(-1, 3)
+    r, layer = np.linalg.norm(lattice[:, :2], axis=1) / SPACING, np.round(lattice[:, 2] / SPACING).astype(int)
+    body = lattice[(r < 6) & (layer < layers) | (r < 2)]
+    rim = lattice[(r > 4) & (r < 6) & (layer < layers)]
+    crumbs = SPACING * np.array([[5.0, 0, layers + 0.6], [-5.0, 0, layers + 0.6]])[:strays]
+    held = within_outline(body, np.concatenate([rim, crumbs]), SPACING)
+    assert np.array_equal(held, np.round(body[:, 2] / SPACING) < layers)
 
 
 def test_held_particles_do_what_a_box_written_by_hand_does():

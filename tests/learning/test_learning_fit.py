@@ -1,9 +1,11 @@
 """The chain theta -> motion -> video -> prior -> gradient, and the descent."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
+from gaussian_prior import GaussianPrior
 from small_scene import DAMPED, bar, bar_chain, cameras, capture, world
 
 from physics3d.gaussians.carry import carry
@@ -127,6 +129,19 @@ def test_descent_finds_the_truth_from_random_frames_and_views_and_leaves_the_uns
     assert torch.equal(course[-1].theta, theta)
 
 
+def test_losses_of_a_prior_that_draws_noise_differ_by_the_videos_alone():
+    """What is asked between two all but equal materials changes nothing of their losses; another seed does, for it is
+    another noise."""
+    chain, field = toy()
+    noisy = replace(chain, prior=GaussianPrior(mean=chain.clips[0], deviation=0.1))
+    at = lambda more: field.zero() + torch.tensor([more, 0.0], dtype=torch.float64)
+    first, other, again = (noisy.measure(at(more), 0) for more in (0.0, 0.3, 1e-9))
+    assert abs(again - first) < 1e-6 * first
+    spread = [noisy.measure(at(0.0), seed) for seed in range(1, 9)]
+    assert max(spread) - min(spread) > 1e-3 * first
+    assert other != pytest.approx(first, rel=1e-3)
+
+
 def test_same_seed_same_path():
     one, two = (fit(*toy(), torch.zeros(2, dtype=torch.float64), **OPTIONS | {"steps": 5})[1] for _ in "ab")
     assert [point.loss for point in one] == [point.loss for point in two]
@@ -141,11 +156,12 @@ def test_stay_holds_an_uncertain_parameter_near_its_start():
 
 
 def seen_as(brightness, start: float, span: float = 1e4) -> tuple[Chain, GlobalField]:
-    """A chain whose picture is as bright as `brightness` of ln E, recorded at E = 1, with stripes that nothing
-    explains."""
+    """A chain whose second picture is as bright as `brightness` of ln E, recorded at E = 1, with stripes that nothing
+    explains; the first one is dark."""
     field = GlobalField(start={"youngs_modulus": torch.tensor(start)}, learn=("youngs_modulus",), span=span)
     simulate = lambda theta: field.parameters(theta)["youngs_modulus"].log()
-    render = lambda motion, view, frames: (0.5 + brightness(motion)).expand(len(frames), 3, 4, 3)
+    lit = lambda motion, frames: torch.where(frames > 0, 0.5 + brightness(motion), 0.3)
+    render = lambda motion, view, frames: lit(motion, frames)[:, None, None, None].expand(-1, 3, 4, 3)
     stripes = 0.01 * torch.tensor([1.0, -1.0, 1.0, -1.0])[:, None]
     clip = render(torch.tensor(0.0).double(), 0, torch.arange(2)) + stripes
     return Chain(simulate=simulate, render=render, clips={0: clip}, prior=Exemplar(blur=(0.0,))), field

@@ -10,6 +10,7 @@ from scipy import ndimage
 
 from physics3d.learning.foretold import foretold
 from physics3d.learning.identify import Oscillations, Swing
+from physics3d.learning.large_swing import SMALL
 from physics3d.learning.seen_modes import Sight
 from physics3d.metrics.image import likeness
 
@@ -41,9 +42,9 @@ def seen_at(angles):
 def swing():
     one = np.ones((1, 1))
     modes = Oscillations(
-        shape=one, span=one, frequency=np.array([FPS / PERIOD]), damping=np.zeros(1), wide=np.zeros(2), power=1.0
+        shape=one, span=one, frequency=np.array([FPS / PERIOD]), damping=np.zeros(1), large=SMALL, power=1.0
     )
-    return Swing(modes=modes, amplitude=np.array([[ANGLE, 0.0]]), rest=np.zeros(1), wide=np.zeros(2), unexplained=0.0)
+    return Swing(modes=modes, amplitude=np.array([[ANGLE, 0.0]]), rest=np.zeros(1), large=SMALL, unexplained=0.0)
 
 
 def angles_at(frames):

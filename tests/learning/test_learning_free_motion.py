@@ -97,6 +97,18 @@ def test_stiffness_and_damping_come_back_without_a_guess(seed, shows):
     assert shows < 1 or np.linalg.norm(motion.at(0.0) - q[0]) < 0.05 * np.linalg.norm(q[0])
 
 
+@pytest.mark.parametrize("off", [0.7, 1.3])
+def test_no_period_is_skipped_from_a_start_that_is_far_off(off, rng):
+    """Seven periods are seen: a frequency that is 30 % off is out of step by two of them in the end, and no windows
+    that grow from the first half period on are needed. What a clip says of its frequency is right to some per cent."""
+    body = chain(zones=1)
+    truth = Material(stiffness=math.log(4.0), zones=np.zeros(1), ratio=math.log(0.2), time=math.log(0.06))
+    clip, _ = filmed(body, truth, rng)
+    f, _, _ = roots(modal(body, truth)[0], 0.2, 0.06)
+    _, motion = fit(body, clip, release=0, reference=len(clip.gram) - 1, frequency=off * f[0], log=Log(None))
+    assert motion.frequency[0] == pytest.approx(f[0], rel=0.02)
+
+
 def test_zones_are_taken_where_the_clip_asks_for_them(rng):
     body = chain(zones=2)
     truth = Material(stiffness=math.log(5.0), zones=np.array([0.8, -0.8]), ratio=math.log(0.2), time=math.log(0.1))

@@ -11,11 +11,13 @@ from scipy.linalg import expm
 
 from physics3d.boundaries.impulse import Impulse
 from physics3d.learning.fields import GlobalField
+from physics3d.learning.film_next import film_next, recordings
 from physics3d.learning.likelihood import ratio
 from physics3d.learning.loss import Chain
 from physics3d.learning.mirror import NAMES
 from physics3d.learning.sandwich import Evidence
-from physics3d.learning.which_model import LITTLE, TIE, compared, film_next, recordings, simpler
+from physics3d.learning.search import search
+from physics3d.learning.which_model import LITTLE, TIE, compared, simpler
 from physics3d.log import Log
 from physics3d.priors.exemplar import Exemplar
 
@@ -87,6 +89,21 @@ def field_of(spring: float, branch: float, time: float) -> GlobalField:
 @pytest.fixture
 def field() -> GlobalField:
     return field_of(E, M, TAU)
+
+
+@pytest.mark.parametrize("off", [7.0, 10.0, 40.0, 0.1])
+def test_a_search_finds_a_valley_that_its_steps_skip(off):
+    """Eight swings that hardly die leave a valley a tenth wide in stiffness to either side; the steps are factors of
+    two."""
+    little = M / 4
+    field = field_of(off * E, off * little, TAU)
+    chain = chain_of(field, (E, little, TAU), seconds=8.0, frames=96)
+    stiffer = torch.tensor([1.0, 1.0, 0.0]).double()
+    offsets = [i * math.log(2) for i in range(-4, 5)]
+    theta, course = search(chain, field, stiffer, offsets, seed=0, log=Log(None))
+    found = float(field.parameters(theta)[NAMES[0]])
+    assert found == pytest.approx(E, rel=0.1)
+    assert course[-1].loss < 0.5 * chain.still(field.zero(), 0)
 
 
 def test_simpler_models_begin_with_the_same_swing():

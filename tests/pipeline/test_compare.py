@@ -2,6 +2,7 @@
 
 import csv
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,14 +10,18 @@ import torch
 from PIL import Image
 
 from physics3d.metrics.image import psnr
-from pipeline.compare import deformed, main, of_variant
-from pipeline.compare_page import FIELD, FILMED, FROZEN, Row, better, overall, ties, write
+from physics3d.motion.stills import FIRST, LAST, MEAN
+from pipeline.compare import FORETOLD, compare, deformed, main, of_takes, of_variant, unasked
+from pipeline.compare_page import FIELD, FILMED, FROZEN, IMAGE, TOLD, WHOLE, Compared, Row, better, overall, ties, write
 from pipeline.flow import first, plan
+from pipeline.settings import choices
 from pipeline.stage import load, run
 from pipeline.sweep import Variant, asked
+from pipeline.told import Table
+from stages import foretell
 
 ROWS = [
-    Row(scene="cake", method="filmed", scores={}, video=torch.zeros((9, 12, 16, 3), dtype=torch.uint8)),
+    Row(scene="cake", method="filmed", scores={}, video=torch.zeros((9, 12, 16, 3), dtype=torch.uint8), fps=18.0),
     Row(scene="cake", method="frozen first frame", scores={"psnr": 25.0, "flow_error": 1.0}),
     Row(
         scene="cake",
@@ -35,7 +40,8 @@ def test_every_number_is_on_the_page_and_the_best_is_bold(tmp_path):
         ("hat", "physics3d"): "capture: no photographs",
         ("cake", "physgaussian"): "render: nothing (traceback: /x/y.txt)",
     }
-    write(tmp_path, ROWS, lost, {"seed": 7, "device": "cpu"}, words=["profile=smoke", "output=/x", "learn.steps=3"])
+    found = Compared(rows=ROWS, lost=lost, left_out={("cake", "physdreamer"): "of another material"})
+    write(tmp_path, found, {"seed": 7, "device": "cpu"}, words=["profile=smoke", "output=/x", "learn.steps=3"])
     text = (tmp_path / "compare.md").read_text()
     cake = text[text.index("## cake") : text.index("## hat")]
     rows = {line.split("|")[1].strip(): line for line in cake.splitlines() if line.startswith("| ")}
@@ -43,11 +49,15 @@ def test_every_number_is_on_the_page_and_the_best_is_bold(tmp_path):
     assert "**30**" in rows["physics3d"] and "**0.25**" in rows["physics3d"] and "| 100 |" in rows["physics3d"]
     assert "**" not in rows["frozen first frame"] and "| 25 |" in rows["frozen first frame"]
     assert {line.count("|") for line in rows.values()} == {2 + 3}, "two measures are known of any method"
-    assert list(rows) == ["method", "frozen first frame", "without_filling", "physics3d", "physgaussian"]
+    named = ["frozen first frame", "without_filling", "physics3d", "physgaussian", "physdreamer"]
+    assert list(rows) == ["method", *named]
     assert "| not done: render: nothing |" in rows["physgaussian"]
+    assert "| left out: of another material |" in rows["physdreamer"]
+    assert "filmed for 0.5 s" in cake, "nine frames at 18 per second"
     assert "| physics3d | not done: capture: no photographs |" in text[text.index("## hat") :]
     assert '`make compare SCENES=cake,hat PROFILE=smoke ARGS="learn.steps=3"`, seed 7' in text
-    assert "1e5 (between 8e4 and 1.2e5)" in text
+    assert "- physics3d learned youngs_modulus 1e5 (between 8e4 and 1.2e5)" in text
+    assert "14.72" in text[text.index("## What others have published") :]
     table = list(csv.DictReader((tmp_path / "compare.csv").open()))
     assert [float(row["psnr"] or math.nan) for row in table[1:]] == [25.0, 30.0, 28.0]
     # a line of six pictures for what was filmed, and one for the method that has a video
@@ -62,19 +72,26 @@ def test_means_are_of_the_scenes_on_which_every_method_ended():
     names = {"a": "physgaussian", "b": "physics3d"}
     rows = [Row(scene=scene, method=names[m], scores={"psnr": value}) for (scene, m), value in psnr.items()]
     rows.append(Row(scene="cup", method="image modes", scores={"psnr": 41.0}))  # of real takes alone
-    table = overall(rows, {("cup", "physics3d"): "learn: nothing"}, ["cake", "hat", "cup"])
+    lost = {("cup", "physics3d"): "learn: nothing"}
+    table = overall(Compared(rows=rows, lost=lost, left_out={("cup", "physdreamer"): "of another material"}))
     assert "2 of 3 scenes" in table[0]
     assert "| physgaussian | 20 | **30** | 40 | **25** |" in table
     assert "| physics3d | **22** | 26 | not done | 24 |" in table
     assert "| image modes |  |  | **41** |  |" in table
+    assert "| physdreamer |  |  | - |  |" in table
+
+
+SMALL = (
+    "profile=smoke", "device=cpu", "learn.search=0", "learn.polish=0", "learn.steps=0", "learn.image_scale=0.5",
+    "scene.source.frames=6", "simulate.frames=6", "learn.frames=6",
+)  # fmt: skip
+USUAL = ("capture", "reconstruct", "fill", "learn", "simulate", "render", "evaluate")
 
 
 @pytest.fixture(scope="module")
 def ball(tmp_path_factory) -> Variant:
     """The ball by the whole method, every step filed, as a run leaves it."""
-    words = ["profile=smoke", "device=cpu", f"output={tmp_path_factory.mktemp('ball')}"]
-    words += ["learn.search=0", "learn.polish=0", "learn.steps=0", "learn.image_scale=0.5"]
-    words += ["scene.source.frames=6", "simulate.frames=6", "learn.frames=6"]
+    words = [*SMALL, f"output={tmp_path_factory.mktemp('ball')}"]
     _, (variant,) = asked(["scenes=ball", "methods=physics3d", "runner=thread", *words])
     capture = first(variant.config, Path(variant.config["output"]) / "artifacts")
     run(capture, "cpu")
@@ -102,6 +119,51 @@ def test_the_deformation_field_is_fitted_once_and_plays_what_it_has_seen(ball):
     assert set(row.scores) == set(of_variant(ball)[-1].scores)
     seen, unseen = (capture.take(role).videos[0][: len(row.video)] for role in ("learn", "evaluate"))
     assert psnr(row.video, seen) > psnr(row.video, unseen)
+
+
+def test_a_scene_that_fails_costs_the_others_nothing_and_what_is_filed_stays(ball, tmp_path, prefect):
+    """Photographs that are not there, beside the ball, of which everything is filed but its deformation field."""
+    shelf = Path(ball.config["output"]) / "artifacts"
+    filed = lambda: {p: p.stat().st_mtime_ns for p in shelf.glob("*/[!.]*/manifest.json") if p.parts[-3] in USUAL}
+    before = filed()
+    words = [*SMALL, f"output={ball.config['output']}", f"data={tmp_path / 'nowhere'}", f"out={tmp_path}"]
+    assert compare(["scenes=photos,ball", "methods=physics3d", *words]) == 1
+    assert filed() == before and len(before) >= len(USUAL)
+    text = (tmp_path / "compare.md").read_text()
+    assert "| physics3d | not done: capture:" in text and "nowhere" in text
+    rows = list(csv.DictReader((tmp_path / "compare.csv").open()))
+    assert {row["method"] for row in rows if row["scene"] == "ball"} == {FILMED, FROZEN, FIELD, "physics3d"}
+    assert not [row for row in rows if row["scene"] == "photos"]
+
+
+def test_rows_of_takes_of_unknown_cause_are_means_over_the_takes():
+    """The modes that were seen are the whole method's, the material before learning is the given one's."""
+    cells = lambda psnr, flow: {"psnr": psnr, "flow_error": flow, "frequency": 2.0}
+    told = {"modes as seen": (30.0, 0.2), "material before": (20.0, 1.1), "frame 0, frozen": (22.0, 1.0)}
+    told |= {"what was seen, again": (18.0, 1.4), IMAGE: (29.0, 0.5)}
+    takes = (("a", 0.0), ("b", 4.0))
+    table = {f"{take}: {name}": cells(psnr + more, flow) for take, more in takes for name, (psnr, flow) in told.items()}
+    table["a: modes as seen"]["flow_error"] = None  # unknown of one take: of all there is no mean
+    table |= {f"{take}: reference": {"psnr": None, "frequency": 2.0} for take in "ab"}
+    whole = Row(scene="real", method=WHOLE, scores={}, seconds=5.0)
+    rows = {row.method: row for row in of_takes(whole, Table(step="foretell", values=table))}
+    assert set(rows) == {WHOLE, "physgaussian", FROZEN, FIELD, IMAGE}
+    assert rows[WHOLE].scores == {"psnr": 32.0} and rows[WHOLE].seconds == 5.0
+    assert rows["physgaussian"].scores == {"psnr": 22.0, "flow_error": pytest.approx(1.1)}
+
+
+def test_methods_that_takes_of_unknown_cause_cannot_tell_apart_are_left_out_with_a_word():
+    _, variants = asked(["scenes=carnation_real", f"methods={','.join(choices('method'))}", "data=x"])
+    whole = next(v for v in variants if v.method == WHOLE)
+    why = {v.method: unasked(v, whole) for v in variants if v is not whole}
+    assert why.pop("physgaussian") == "", "it learns nothing, and has a row"
+    assert {method for method, said in why.items() if "material" not in said} == {"without_filling"}
+    assert all(why.values())
+
+
+def test_what_is_foretold_has_the_names_that_the_table_knows():
+    assert set(FORETOLD) == {foretell.SEEN, foretell.START, foretell.AGAIN, FIRST}
+    assert set(TOLD) - {FROZEN, FIELD} == {foretell.IMAGE, foretell.LEARNED, LAST, MEAN}
 
 
 def clips(off: dict[str, float], frames: int = 61) -> dict[str, torch.Tensor]:
@@ -149,7 +211,9 @@ def test_ties_are_called_ties_and_say_what_would_settle_them():
         Row(scene="cake", method=name, scores={"psnr": psnr}, video=made[name])
         for name, psnr in (("shell", 20.0), ("full", 30.0), ("elastic", 29.9))
     ]
+    rows[2] = replace(rows[2], models=["to film next: a weight: should settle it (ln B +4.0)"])
     text = ties(rows)
+    assert text[3:] == ["- full itself says: to film next: a weight: should settle it (ln B +4.0)"]
     assert "above elastic" in text[0] and text[0].endswith("a tie")
     assert "above shell" in text[1] and "tie" not in text[1]
     assert "does not tell full, elastic apart" in text[2] and "second force" in text[2]

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -141,6 +142,15 @@ def test_make_hands_on_what_it_was_given(made, text):
         names = ("DATA", "OUT", "REAL", "PRED", "MATERIAL", "UNSEEN", "FORMAT", "FRAME", "SIZE", "LENGTH")
         env = made(target, *(f"{name}={text}" for name in names))[1]
         assert {env[name] for name in names} == {text}
+
+
+@pytest.mark.parametrize("text", ["stable_video", "it's $HOME", "a  b", "$(shell touch x)", '"`$x', "[1,2]", ""])
+def test_entries_beside_the_values_of_make_are_words_as_in_args(made, text):
+    """make run SCENE=plush prior=stable_video: a word that make takes for one of its own variables is not lost."""
+    words, env = made("run", f"prior.prompt={text}", "SCENE=plush", "prior=wan", "ARGS=seed=1", home="/x")
+    assert words[-3:] == ["scene=plush", "profile=default", "method=physics3d"]
+    assert shlex.split(env["ARGS"]) == ["seed=1", "prior=wan", f"prior.prompt={text}"]
+    assert made("bench-gpu", "device=cuda", "seed=1")[0][-3:] == ["benchmarks/gpu.py", "device=cuda", "seed=1"]
 
 
 @pytest.mark.parametrize("text", [t for t in PATHS if "/" not in t and "%" not in t and "=" not in t])

@@ -75,6 +75,20 @@ def test_the_expected_gradient_is_that_of_a_quadrature(name):
     assert float(expected.abs().max()) > 10 * float(error.max()), "or any gradient would do"
 
 
+@pytest.mark.parametrize("alpha, sigma", [(1.0, 0.3), (1.0, 7.0), (0.8, 0.6), (0.1, 0.9)])
+def test_the_pull_is_weighed_as_dreamfusion_weighs_noise(alpha, sigma):
+    """Poole et al. (2022), eq. 3 with w = sigma^2, for z_t of variance one: w (n_hat - n), where n_hat is what z_t says
+    of the noise if x0_hat is the clean code. Levels that are not of variance one are brought there, by 1/r."""
+    r = (alpha**2 + sigma**2) ** 0.5
+    prior, z0, x0_hat = GaussianPrior(mean=waving(SHAPE)), waving(SHAPE), waving(SHAPE).flip(0)
+    noise = waving(SHAPE).flip(1)
+    z_t = (alpha * z0 + sigma * noise) / r
+    n_hat = (z_t - alpha / r * x0_hat) / (sigma / r)
+    found = prior.weight(Level(alpha=alpha, sigma=sigma)) * (z0 - x0_hat)
+    # float64; noise is taken off and put on again
+    torch.testing.assert_close(found, (sigma / r) ** 2 * (n_hat - noise), rtol=0, atol=1e-13)
+
+
 @pytest.mark.parametrize("of", ["sds", "moving_minus_still"])
 def test_several_levels_vary_less_than_as_many_draws_one_by_one(of):
     """The mean of 8 independent draws has an eighth of the variance of one; 4 levels and their mirrored noises less
@@ -118,6 +132,20 @@ def test_videos_are_compared_by_their_expected_denoising_error():
         denoising_loss(prior, mean + off, None, generator=torch.Generator().manual_seed(2)) for off in (0, 0.3, 0.6)
     ]
     assert worse == sorted(worse), "what is further from the mean is less probable"
+
+
+def test_which_of_two_videos_is_more_probable_does_not_depend_on_the_noise():
+    """By a noise and its negative what is linear in it cancels: at one level, of a linear prior, the difference of two
+    losses is that of the expected ones, exactly."""
+    mean = waving(SHAPE)
+    prior = GaussianPrior(mean=mean, sigma=(1.0, 1.0 + 1e-12))
+    one, other = mean.flip(0), mean + 0.3
+    for seed in range(3):
+        losses = [
+            denoising_loss(prior, video, None, generator=torch.Generator().manual_seed(seed)) for video in (one, other)
+        ]
+        # float64; sums of 360 squares
+        assert losses[0] - losses[1] == pytest.approx(prior.expected_loss(one) - prior.expected_loss(other), rel=1e-8)
 
 
 def test_draws_cover_every_range_of_levels_once_and_mirror_their_noise():

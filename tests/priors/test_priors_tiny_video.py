@@ -209,11 +209,17 @@ def test_a_larger_video_is_brought_to_the_size_of_the_network(prior):
     torch.testing.assert_close(prior.encode(video), torch.full((4, 3, 8, 8), -0.5))
 
 
-def test_sizes_that_it_was_not_trained_on_are_refused(prior):
-    with pytest.raises(ValueError, match=r"learn\.frames=4"):
-        prior.encode(torch.zeros(5, 8, 8, 3))
-    with pytest.raises(ValueError, match="square"):
-        prior.encode(torch.zeros(4, 8, 12, 3))
+def test_numbers_of_frames_that_it_was_not_trained_on_are_refused(prior):
+    for asked in (lambda: prior.encode(torch.zeros(5, 8, 8, 3)), lambda: prior.require_frames(5)):
+        with pytest.raises(ValueError, match=r"learn\.frames is 5; .* set learn\.frames=4"):
+            asked()
+
+
+def test_of_a_picture_that_is_not_square_the_middle_is_seen(prior):
+    video = random(4, 8, 8, 3)
+    for beside, below in ((4, 0), (0, 6)):
+        wide = torch.nn.functional.pad(video, (0, 0, beside // 2, beside // 2, below // 2, below // 2), value=9.0)
+        assert torch.equal(prior.encode(wide), prior.encode(video))
 
 
 def test_without_weights_the_remedy_is_named(tmp_path):

@@ -9,6 +9,7 @@ import torch
 from gaussian_prior import GaussianPrior
 from small_scene import DAMPED, ELASTIC, POKE, bar, cameras, capture, learner
 
+from physics3d.boundaries.half_space import HalfSpace
 from physics3d.learning.chain import chain_of
 from physics3d.learning.course import WAYS
 from physics3d.learning.imagined import Imagined
@@ -48,6 +49,20 @@ def test_stiffness_is_recovered_and_documented(clip, tmp_path):
     estimate.save(tmp_path / "estimate")
     again = Estimate.load(tmp_path / "estimate")
     assert again.history == estimate.history and again.intervals == estimate.intervals
+
+
+@pytest.mark.parametrize(("place", "solver"), [(0.2, "modes"), (0.085, "grid")])
+def test_the_solver_is_that_of_what_is_learned_not_of_where_it_starts(place, solver, tmp_path):
+    """The bar bends to 0.084 m, ten times as soft to 0.142 m, and its particles are 0.025 m wide: a wall is far away,
+    or was touched, and a bar that is five times as stiff, without a wall, fits best. 5 %: as above."""
+    wall = HalfSpace(point=(place, 0.0, 0.0), normal=(-1.0, 0.0, 0.0))
+    stage = learner(START, ("youngs_modulus",), search=4, search_span=8.0, steps=6, solver="auto")
+    stage = replace(stage, world=replace(stage.world, boundaries=(*stage.world.boundaries, wall)))
+    seen = capture(ELASTIC, solver=solver, boundaries=(wall,))
+    estimate = stage(seen, *bar(), log=Log(tmp_path, quiet=True))
+    assert float(estimate.parameters["youngs_modulus"]) == pytest.approx(2e4, rel=0.05)
+    said = (tmp_path / "log.txt").read_text()
+    assert ("solver: grid" in said) == ("the grid takes over" in said) == (solver == "grid")
 
 
 @pytest.mark.parametrize("work, ways", [
