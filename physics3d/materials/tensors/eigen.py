@@ -68,7 +68,7 @@ def eigen(real: type) -> wp.Function:
             u = vec3(ab, bb, bc)
         elif cc > aa:
             u = vec3(ac, bc, cc)
-        u = u / wp.sqrt(wp.dot(u, u))
+        u = (real(1.0) / wp.sqrt(wp.dot(u, u))) * u
         # v, w across it
         sign = real(1.0)
         if u[2] < real(0.0):

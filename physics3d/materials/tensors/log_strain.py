@@ -174,7 +174,7 @@ def adjoint_of_rescaled(real: type) -> wp.Function:
     B = 2 (I + X_next) adj_X_next in principal axes is the adjoint of the strain that is of_dev.
     """
     mat33, vec3 = matrix(real), vector(real)
-    eigen_, log1p_ = eigen(real), log1p_extended(real, FLOOR)
+    eigen_, log1p_, expm1_ = eigen(real), log1p_extended(real, FLOOR), expm1(real)
     log_slope_, exp_slope_ = log_slope(real), exp_slope(real)
     floor = real(FLOOR)
 
@@ -191,7 +191,10 @@ def adjoint_of_rescaled(real: type) -> wp.Function:
             real(2.0) * (of_dev * dev[1] + of_mean * mean),
             real(2.0) * (of_dev * dev[2] + of_mean * mean),
         )
-        root = vec3(wp.exp(real(0.5) * y[0]), wp.exp(real(0.5) * y[1]), wp.exp(real(0.5) * y[2]))
+        one = real(1.0)
+        root = vec3(
+            one + expm1_(real(0.5) * y[0]), one + expm1_(real(0.5) * y[1]), one + expm1_(real(0.5) * y[2])
+        )  # fmt: skip
         Qt = wp.transpose(Q)
         A = Qt * (adj_A * Q)
         B = Qt * (adj_X_next * Q)

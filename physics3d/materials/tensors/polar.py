@@ -35,7 +35,7 @@ def _polar_rotation(real: type) -> wp.Function:
 
     @wp.func(name=f"polar_rotation_{real.__name__}")
     def rotation(F: mat33, b: mat33, i1: real, l: real, D: real):
-        return (real(0.5) * (l * l + i1) * F + l * cofactor_(F) - b * F) / D
+        return (real(1.0) / D) * (real(0.5) * (l * l + i1) * F + l * cofactor_(F) - b * F)
 
     return rotation
 
@@ -116,7 +116,7 @@ def adjoint_of_stretch(real: type) -> wp.Function:
         T = l * one - V  # eigenvalues s_i + s_j
         D = denominator(wp.determinant(T), i1)
         W = V * A - A * V
-        q = (cofactor_(T) * vec3(W[2, 1], W[0, 2], W[1, 0])) / D
+        q = (real(1.0) / D) * (cofactor_(T) * vec3(W[2, 1], W[0, 2], W[1, 0]))
         return (A - wp.skew(q)) * rotation(F, b, i1, l, D)
 
     return adjoint_of_stretch
