@@ -47,7 +47,7 @@ def write(words: list[str]) -> None:
     if any(importlib.util.find_spec(name) is None for name in ("pytetwild", "pyvista")):
         raise ValueError("the mesher is missing; pip install pytetwild pyvista")
     world = source.world if isinstance(source, MadeTwin) else source.world()
-    name = source.name if isinstance(source, MadeTwin) else "carnation"
+    name = source.name if isinstance(source, MadeTwin) else source.motion
     solids = source.solids()
     body = finite_elements.meshed(solids, world, edge)
     print(f"mesh      {body.gradient.shape[1]} nodes, {1e6 * body.weight.sum():.1f} cm^3", flush=True)

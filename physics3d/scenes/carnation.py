@@ -62,13 +62,14 @@ class CarnationTwin(AbstractSource):
     shear_relaxation_time: Duration = 0.15  # 1/k_d [s]
     bulk_relaxation_time: Duration = 0.15  # 1/k_v [s]
     density: Positive = 300.0  # petals hold much air [kg/m^3]
-    # how the motion is computed where none is kept: finer than the pipeline
+    # how it moves: as was found once (`reference_motion.py`); where nothing is kept, by a grid finer than the pipeline's
+    motion: str = "carnation"  # file of it
     dx: Length = 0.010  # cell of the grid [m]
     seed: Seed = 0
     device: Device = "cpu"
 
     def files(self) -> tuple[str, ...]:
-        kept = path_of("carnation")
+        kept = path_of(self.motion)
         return (str(kept),) if kept.exists() else ()
 
     @property
@@ -81,6 +82,7 @@ class CarnationTwin(AbstractSource):
         studio = Studio([*meshes, *surroundings(self.seed)], room.DAYLIGHT, openness_rays=24, seed=self.seed)
         return captured(
             name="carnation",
+            motion=self.motion,
             world=self.world(),
             pokes=self.pokes(),
             matter=particles(solids, self.dx / 2, self.seed),

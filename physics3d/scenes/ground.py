@@ -9,13 +9,12 @@ span    = the largest angle between two cameras, as seen from the middle
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
-
-from physics3d.open3d_import import open3d
+from jaxtyping import Bool, Float64
 
 TILT = 15.0  # largest angle between the cameras' level and the floor's normal [deg]
 TOWARDS_MEAN_UP = 0.005  # weight of the cameras' mean up, for cameras that do not turn around the object
 FLOOR = 0.08  # least share of the points that makes a plane a floor
+TRIALS = 1000  # planes through three points that are tried
 FLAT = 0.01  # thickness of a floor, over the distance of the cameras
 PARALLEL = 1e-3  # mean squared sine of the axes' angles below which they are taken as parallel
 
@@ -70,19 +69,38 @@ def floor_plane(
 
     Walls and table tops are found first where they have more points, and set aside.
     """
-    o3d = open3d()
-    o3d.utility.random.seed(seed)
+    rng = np.random.default_rng(seed)
     left, total = points, len(points)
     for _ in range(5):
         if len(left) < max(20, FLOOR * total):
             return None
-        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(left))
-        plane, inside = cloud.segment_plane(thickness, 3, 1000)
-        if len(inside) < FLOOR * total:
+        plane, inside = fullest_plane(left, thickness, rng)
+        if inside.sum() < FLOOR * total:
             return None
-        plane = np.asarray(plane) / np.linalg.norm(plane[:3])
         plane = plane * (1 if plane[:3] @ up >= 0 else -1)
         if plane[:3] @ up > np.cos(np.radians(TILT)) and plane[:3] @ middle + plane[3] > -2 * thickness:
             return plane
-        left = np.delete(left, inside, 0)
+        left = left[~inside]
     return None
+
+
+def fullest_plane(
+    points: Float64[np.ndarray, "n 3"], thickness: float, rng: np.random.Generator
+) -> tuple[Float64[np.ndarray, "4"], Bool[np.ndarray, " n"]]:
+    """((n, d) of the plane n.x + d = 0 with the most points within `thickness`, which these are), of three points or more.
+
+    Random sample consensus (Fischler and Bolles 1981), then least squares over the points found. Open3D has it as well,
+    but on threads, and finds another plane each time.
+    """
+    a, b, c = points[rng.integers(len(points), size=(TRIALS, 3))].swapaxes(0, 1)
+    normals = np.cross(b - a, c - a)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)  # three in a row: no plane
+    offsets = np.where(length[:, 0] > 0, -(normals * a).sum(1), np.inf)
+    near = lambda n, d: np.abs(points @ n + d) < thickness
+    inside = near(*max(zip(normals, offsets), key=lambda one: near(*one).sum()))
+    if inside.sum() < 3:
+        return np.zeros(4), inside  # all in one line
+    middle = points[inside].mean(0)
+    normal = np.linalg.svd(points[inside] - middle, full_matrices=False)[2][2]
+    return np.append(normal, -normal @ middle), inside

@@ -88,11 +88,11 @@ def solve(
     _extract(pycolmap, database, images, names, log)
     if stills:
         _extract(pycolmap, database, images, sorted(stills), log)
-        _match(pycolmap, database, folder / "pairs.txt", [(s, n) for s in sorted(stills) for n in names], log=log)
+        _match(pycolmap, database, folder / "pairs.txt", [(s, n) for s in sorted(stills) for n in names], seed=seed, log=log)
         for still, clip in stills.items():  # before the many pairs of photographs are compared
             if not _compared(pycolmap, database, still):
                 raise _unplaced(clip, "not one photograph shows what it shows")
-    _match(pycolmap, database, folder / "pairs.txt", pairs(names, ordered=ordered), log=log)
+    _match(pycolmap, database, folder / "pairs.txt", pairs(names, ordered=ordered), seed=seed, log=log)
     standing = share_explained(_matches(pycolmap, database, without=set(stills)), _longest_side(pycolmap, database))
     if standing is not None:
         log.metric("matches_without_parallax", standing)
@@ -165,6 +165,7 @@ def _extract(pycolmap, database: Path, images: Path, names: list[str], log) -> N
     """Features of all photographs, the largest `FEATURES` of each: COLMAP keeps whole octaves, up to twice as many."""
     options = pycolmap.FeatureExtractionOptions()
     options.sift.max_num_features = FEATURES
+    options.num_threads = 1  # pictures are numbered as they are finished, and the answer hangs on their numbers
     mode = pycolmap.CameraMode.SINGLE if _one_size(images, names) else pycolmap.CameraMode.PER_IMAGE
     reader = pycolmap.ImageReaderOptions()
     for some in log.progress([names[i : i + 4] for i in range(0, len(names), 4)], "finding features, by four"):
@@ -197,14 +198,14 @@ def _camera(pycolmap, database: Path, name: str) -> int:
         opened.close()
 
 
-def _match(pycolmap, database: Path, list_file: Path, wanted: list[tuple[str, str]], *, log) -> None:
-    options = pycolmap.ImportedPairingOptions()
-    options.match_list_path = list_file
+def _match(pycolmap, database: Path, list_file: Path, wanted: list[tuple[str, str]], *, seed: int, log) -> None:
+    options, verification = pycolmap.ImportedPairingOptions(), pycolmap.TwoViewGeometryOptions()
+    options.match_list_path, verification.ransac.random_seed = list_file, seed
     bar = log.progress(None, "comparing pairs of photographs", total=len(wanted))
     for i in range(0, len(wanted), PAIRS_AT_ONCE):
         some = wanted[i : i + PAIRS_AT_ONCE]
         list_file.write_text("".join(f"{a} {b}\n" for a, b in some))
-        pycolmap.match_image_pairs(database, pairing_options=options)
+        pycolmap.match_image_pairs(database, pairing_options=options, verification_options=verification)
         bar.update(len(some))
     bar.close()
 
@@ -275,7 +276,9 @@ def _placed(
     best, its_angle, most = None, FIRST_ANGLES[0], (0, 0)
     for angle in FIRST_ANGLES:
         options = pycolmap.IncrementalPipelineOptions()
-        options.min_model_size, options.random_seed, options.mapper.init_min_tri_angle = 3, seed, angle
+        options.min_model_size, options.mapper.init_min_tri_angle = 3, angle
+        options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
+        options.num_threads = options.mapper.num_threads = 1  # sums of many threads are another answer each time
         bar = log.progress(None, f"placing photographs, from {angle:g} degrees", total=len(names))
         models = pycolmap.incremental_mapping(
             database,

@@ -57,16 +57,17 @@ def captured(
     log,
     single_object: bool = False,
     noise: float = 4e-4,
+    motion: str = "",
 ) -> Capture:
     """A twin, photographed by `cameras` at rest and filmed by `witness` once for each role in `pokes`.
 
     `matter` is position [m] and volume [m^3] of the particles, by which the grid moves the body where no reference
-    motion of these `solids` is kept (`reference_motion.py`); there are `points` surface points, `noise` [m] off along
+    motion of these `solids` is kept under the name `motion`, or else `name` (`reference_motion.py`); there are `points` surface points, `noise` [m] off along
     each axis.
     """
     images, alphas, found, colors = photographs(studio.pose(), cameras, points=points, noise=noise, seed=seed, log=log)
     position, volume = matter
-    kept = recorded(path_of(name), world, pokes, solids, frames=frames, fps=fps)
+    kept = recorded(path_of(motion or name), world, pokes, solids, frames=frames, fps=fps)
     by = f"the grid, cells of {1e3 * world.dx:.3g} mm" if kept is None else kept[1]
     log.info(f"reference motion: {by}")
     takes = [

@@ -305,7 +305,7 @@ def test_smaller_angles_are_tried_before_giving_up(works_at, tried, tmp_path):
         return {0: SimpleNamespace(num_reg_images=lambda: 9)} if asked[-1] <= works_at else {}
 
     def options():
-        return SimpleNamespace(mapper=SimpleNamespace())
+        return SimpleNamespace(mapper=SimpleNamespace(), triangulation=SimpleNamespace())
 
     library = SimpleNamespace(IncrementalPipelineOptions=options, incremental_mapping=incremental_mapping)
     model, angle = _placed(library, tmp_path / "a.db", tmp_path, tmp_path / "models", ["x"] * 10, 0, Log(None))
@@ -329,7 +329,7 @@ def test_a_model_that_misses_a_clip_is_not_the_last_word(tmp_path):
         return dict(enumerate(made[options.mapper.init_min_tri_angle]))
 
     def options():
-        return SimpleNamespace(mapper=SimpleNamespace())
+        return SimpleNamespace(mapper=SimpleNamespace(), triangulation=SimpleNamespace())
 
     library = SimpleNamespace(IncrementalPipelineOptions=options, incremental_mapping=incremental_mapping)
     names = [*"abcdefgh", "clip"]
