@@ -8,6 +8,11 @@ from torch import Tensor
 from physics3d.artifact import AbstractArtifact, require_finite
 
 
+class NotMoved(ValueError):
+    """With the numbers that were given, the material's above all, no solver moves the body to the end. Who tries many
+    goes on with others."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Trajectory(AbstractArtifact):
     """Where the particles were, frame by frame; frame 0 is the initial state."""

@@ -291,7 +291,7 @@ class Learn:
             places = across(field, theta, angular_frequency(chain.simulate(theta)))
         if not places:
             return theta, points
-        there = places[0] if len(places) == 1 else min(places, key=lambda place: chain.measure(place, self.seed))
+        there = places[0] if len(places) == 1 else min(places, key=lambda place: chain.tried(place, self.seed))
         time = lambda at: physical(field, at)["shear_relaxation_time"]
         log.info(f"a relaxation time of {time(there):.3g} s damps the swing as {time(theta):.3g} s do: tried as well")
         other, more = self.polished(chain, field, there, log)
@@ -349,7 +349,7 @@ class Learn:
             said,
             before=self.before(field),
             rise=lambda d: float(d @ seen.evidence.JJ @ d) / (2 * pixels),
-            loss=lambda d: chain.measure(field.bound(theta + torch.from_numpy(d)), self.seed),
+            loss=lambda d: chain.tried(field.bound(theta + torch.from_numpy(d)), self.seed),
             log=log,
         )
 

@@ -25,6 +25,7 @@ from physics3d.learning.linear import STEP, asked, linearise
 from physics3d.learning.loss import Chain
 from physics3d.learning.which_model import TIE, Verdict, within
 from physics3d.log import Log
+from physics3d.trajectory import NotMoved
 
 LONGER = 3.0  # than the clip, is what could be filmed next
 PULL = 1 / 3  # of the force of a push, that pulls steadily
@@ -52,7 +53,11 @@ def film_next(
             simulate = make()
             return [rise(simulate, chain, theta, tie, JJ, seed=seed) for tie, JJ in zip(ties, first)]
 
-        told = chain.journal.ask("film next", name, theta, *(tie.theta for tie in ties), answer=answer)
+        try:
+            told = chain.journal.ask("film next", name, theta, *(tie.theta for tie in ties), answer=answer)
+        except NotMoved as reason:
+            log.info(f"{name}: not asked, for nothing moves the body so ({reason})")
+            continue
         found[name] = min(tie.ratio.odds(rise=pixels * one) for tie, one in zip(ties, told))
         log.metric(f"film_next/{name}", found[name])
     best = max(found, key=lambda name: found[name], default=None)

@@ -2,8 +2,9 @@
 
 The loss is in `loss.py`. Each step looks at a random choice of views and, spread over the whole clip, of frames. Adam
 steps in theta (`fields.py`), its rate falling to a tenth along a cosine; L is divided by L_0, so that `stay` and the
-clip on the gradient's norm mean the same in every scene. A gradient that is not finite is reported and answered by
-going half the way back to the last good point. `search.py` before and `polish.py` after it need forward runs only.
+clip on the gradient's norm mean the same in every scene. A gradient that is not finite, or a body that nothing moves,
+is reported and answered by going half the way back to the last good point; where nothing moves the body the descent may
+end there. `search.py` before and `polish.py` after it need forward runs only.
 """
 
 import math
@@ -16,6 +17,7 @@ from physics3d.learning.course import Point
 from physics3d.learning.fields import AbstractField, physical
 from physics3d.learning.loss import Chain
 from physics3d.log import Log
+from physics3d.trajectory import NotMoved
 
 MOST_RETREATS = 3  # steps in a row with a gradient that is not finite, before giving up
 
@@ -38,10 +40,11 @@ def fit(
 
     What is returned is the mean of the last quarter of the iterates; or, where losses of single steps can be compared,
     the iterate of lowest loss, if that is better over all views and frames. Raises ValueError when the gradient stays
-    not finite.
+    not finite, NotMoved when theta is not moved.
     """
     generator = torch.Generator().manual_seed(seed)
-    unit = max(chain.measure(field.zero(), seed), 1e-12)
+    unit = chain.tried(field.zero(), seed)
+    unit = max(chain.measure(theta, seed) if math.isinf(unit) else unit, 1e-12)
     theta = field.bound(theta).requires_grad_()
     adam = torch.optim.Adam([theta], lr=learning_rate, betas=(0.8, 0.95))
     good, retreats = theta.detach().clone(), 0
@@ -51,14 +54,23 @@ def fit(
             some_of(list(chain.clips), views_per_step, generator),
             some_frames(chain, frames_per_step, generator),
         )
-        loss, slope = chain.slope(theta, views, frames, generator)
-        theta.grad = slope / unit + stay * theta.detach()
-        if not torch.isfinite(theta.grad).all():
+        why, wall = "", False
+        try:
+            loss, slope = chain.slope(theta, views, frames, generator)
+            theta.grad = slope / unit + stay * theta.detach()
+            if not torch.isfinite(theta.grad).all():
+                why = f"gradient {theta.grad.tolist()} is not finite"
+        except NotMoved as reason:
+            why, wall = str(reason), True
+        if why:
             retreats += 1
-            log.warn(f"step {step}: gradient {theta.grad.tolist()} is not finite; going half the way back")
+            log.warn(f"step {step}: {why}; going half the way back")
+            if retreats > MOST_RETREATS and wall and course:
+                log.warn("the descent ends at the last place where the body can be moved")
+                break
             if retreats > MOST_RETREATS:
                 raise ValueError(
-                    f"learning: the gradient was not finite {retreats} times in a row (step {step}); lower "
+                    f"learning: no finite gradient {retreats} times in a row (step {step}: {why}); lower "
                     f"learn.learning_rate ({learning_rate:g}), learn.duration or learn.span"
                 )
             with torch.no_grad():

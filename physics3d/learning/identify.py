@@ -43,7 +43,9 @@ WIDTH = {"slowing": 0.1, "loss": 1.0, "frequency": 0.05, "damping": 1.0}
 # what frequencies and dampings of one thing differ by from take to take, in the logarithm
 TAKES = np.array([0.03, 0.3])
 LEAST_DAMPING = 0.005  # that a refinement starts from, in 2 pi f
-LEAST_LARGE, MOST_LARGE = np.array([-0.3, -0.9]), np.array([0.3, 3.0])  # k, g
+# k, g; a g below 0 is none, and costs: to rub and to drag the air takes more from a large swing. What creeps back, and
+# two neighbours that beat, look in a short clip as if small ones died out faster, with a damping that the thing has not
+LEAST_LARGE, MOST_LARGE = np.array([-0.3, -0.9]), np.array([0.3, 3.0])
 TOLD = 0.9  # of the unexplained motion: the square of the amplitude has to leave less than the amplitude itself does
 
 
@@ -115,7 +117,8 @@ def identified(body: Reduced, clip: Observed, decay: Decay, *, reference: float 
 
     def named(theta: np.ndarray, poles: np.ndarray, exponent: float) -> tuple[np.ndarray, np.ndarray, LargeSwing]:
         f, d = poles[:, 0] * np.exp(theta[2::2]), poles[:, 1] * np.exp(theta[3::2])
-        return f, d, LargeSwing(slower=float(theta[0]), sooner=float(theta[1]), exponent=exponent, damping=float(d[0]))
+        k, g = float(theta[0]), max(float(theta[1]), 0.0)
+        return f, d, LargeSwing(slower=k, sooner=g, exponent=exponent, damping=float(d[0]))
 
     def cost(theta: np.ndarray, poles: np.ndarray, exponent: float) -> float:
         large, by_f, by_d = theta[:2], theta[2::2], theta[3::2]

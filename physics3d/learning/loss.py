@@ -11,6 +11,7 @@ nothing.
 All that takes long is asked of the chain's journal, so that a learning that was stopped goes on where it was.
 """
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -26,6 +27,7 @@ from physics3d.priors.base import AbstractPrior
 from physics3d.priors.distillation import denoising_loss, distillation_loss
 from physics3d.priors.estimators.base import AbstractEstimator
 from physics3d.priors.estimators.sds import ScoreDistillation
+from physics3d.trajectory import NotMoved
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,20 +95,35 @@ class Chain:
 
     def measure(self, theta: Tensor, seed: int) -> float:
         """The denoising loss over all views and frames, always with the same noise."""
-        return self.journal.ask("measure", theta, seed, answer=lambda: self._measured(theta, seed))
+        return self.journal.ask("measure", theta, seed, answer=lambda: self._measured(theta, seed, self.frames))
+
+    def tried(self, theta: Tensor, seed: int) -> float:
+        """The same of a theta that only a search asks for: infinite where nothing moves the body so, which is said."""
+        try:
+            return self.measure(theta, seed)
+        except NotMoved as reason:
+            why = str(reason).partition("; take ")[0].partition("; enlarge ")[0]  # remedies are for one who wants it
+            self.journal.log.warn(f"tried and left: with {theta.tolist()} the body cannot be moved ({why})")
+            return math.inf
 
     def still(self, theta: Tensor, seed: int) -> float:
         """What `measure` is of the first picture of the motion, standing still."""
-        return self.journal.ask("still", theta, seed, answer=lambda: self._measured(theta, seed, 0 * self.frames))
+        return self.journal.ask(
+            "still", theta, seed, answer=lambda: self._measured(theta, seed, self.frames, drawn=0 * self.frames)
+        )
 
-    def _measured(self, theta: Tensor, seed: int, drawn: Tensor | None = None) -> float:
-        """`drawn`: the frames that are drawn in the place of all."""
+    def unmoved(self, theta: Tensor, seed: int) -> float:
+        """That of the first picture beside the first one filmed: no material explains it."""
+        return self.journal.ask("unmoved", theta, seed, answer=lambda: self._measured(theta, seed, self.frames[:1]))
+
+    def _measured(self, theta: Tensor, seed: int, frames: Tensor, drawn: Tensor | None = None) -> float:
+        """Of these frames. `drawn`: which are drawn in their place."""
         generator, total, pixels = torch.Generator().manual_seed(seed), 0.0, 0
         with torch.no_grad():
             motion = self.simulate(theta)
             for view in self.clips:
-                video = self.render(motion, view, self.frames if drawn is None else drawn)
-                condition = self.condition(view, self.frames)
+                video = self.render(motion, view, frames if drawn is None else drawn)
+                condition = self.condition(view, frames)
                 total += denoising_loss(self.prior, video, condition, generator=generator)
                 pixels += video.numel()
         return total / pixels

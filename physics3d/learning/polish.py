@@ -38,7 +38,7 @@ def polish(
         trial = field.bound(theta + d.clamp(-1, 1))  # at most a factor e at once
         if float((trial - theta).abs().max()) < SHORT:
             break
-        then = chain.measure(trial, seed)
+        then = chain.tried(trial, seed)
         gained = now - then + 0.5 * pull * float(theta.square().sum() - trial.square().sum())
         log.metric("polish/loss", then if gained > 0 else now, step)
         if gained > 0:

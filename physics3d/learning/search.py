@@ -4,8 +4,9 @@ Offsets are tried along a line, equally far apart. Where the lowest loss is at a
 the same step, so that a start which is a factor 100 off is found as one that is a factor 2 off; it ends at the span of
 the field. Between the best and its neighbours the middles are tried as well, for of two places to either side of the
 best valley one may lie in another. A valley is the narrower the more swings a clip shows: where the best that was tried
-explains little more than a picture that stands still, all of the line is looked at again between what was tried, and
-beyond its ends, once or twice. A second valley that is nearly as deep is said: then the clip, as far as the search
+explains little more of what moves than a picture that stands still, all of the line is looked at again between what
+was tried, and beyond its ends, once or twice. What nothing can move, too soft for its force or so stiff that steps
+become too short, is passed over. A second valley that is nearly as deep is said: then the clip, as far as the search
 sees, has two answers.
 """
 
@@ -19,7 +20,7 @@ from physics3d.learning.fields import GlobalField
 from physics3d.learning.loss import Chain
 from physics3d.log import Log
 
-DEEP = 0.75  # of the loss of a picture that stands still: below it something is explained
+DEEP = 0.75  # of what the motion adds to the loss of a picture that stands still: below it something is explained
 FINE = 0.2  # between neighbours that are looked at, in the logarithm: a tenth of a frequency
 NEARLY = 1.5  # as deep: so many times the lowest loss, as of two answers that a descent may still exchange
 
@@ -28,19 +29,21 @@ def search(
     chain: Chain, field: GlobalField, directions: Tensor, offsets: list[float], *, seed: int, log: Log
 ) -> tuple[Tensor, list[Point]]:
     """(theta of the lowest loss among offset * directions, all that were tried, and it again). `offsets` ascend, two or
-    more, equally far apart."""
+    more, equally far apart. Raises NotMoved if none of them moves the body, and the start does not."""
     course: list[Point] = []
     tried: dict[float, Point] = {}
 
     def measure(offset: float) -> None:
         theta = field.bound(offset * directions)
-        tried[offset] = Point(way="search", theta=theta, loss=chain.measure(theta, seed))
+        tried[offset] = Point(way="search", theta=theta, loss=chain.tried(theta, seed))
         course.append(tried[offset])
         log.metric("search/factor", math.exp(offset), len(course) - 1)
         log.metric("search/loss", course[-1].loss, len(course) - 1)
 
     for offset in log.progress(offsets, "coarse search"):
         measure(offset)
+    if all(math.isinf(point.loss) for point in course):
+        chain.measure(field.zero(), seed)  # says what is wrong with the start
     step, limit = offsets[1] - offsets[0], math.log(field.span) + 1e-9
     lowest = lambda: min(tried, key=lambda offset: tried[offset].loss)
     best = lowest()
@@ -56,7 +59,10 @@ def search(
             measure(best + side * step / 2)
     best, width = lowest(), step
     # a diffusion model's losses have a floor that no motion goes below, and cost minutes
-    explained = DEEP * chain.still(field.zero(), seed) if chain.certain else math.inf
+    explained = math.inf
+    if chain.certain:
+        unmoved = chain.unmoved(tried[best].theta, seed)
+        explained = unmoved + DEEP * (chain.still(tried[best].theta, seed) - unmoved)
     while tried[best].loss > explained and step > FINE:
         log.info("nothing tried explains much more than a picture that stands still: looking between and beyond")
         ends = (min(tried), -1), (max(tried), 1)

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy import sparse
 
 from physics3d.matter import Matter
 
@@ -90,20 +91,28 @@ def outside_particles(matter: Matter, held: np.ndarray) -> tuple[Matter, Pins, n
 
 
 def _between(matter: Matter, keep: Bool[np.ndarray, " m"], pinned: Bool[np.ndarray, " m"]) -> Pins:
-    """Four pins on each face that a piece which is kept, and not `pinned` yet, turns to one that is not kept."""
+    """Four pins on each face that a piece which is kept, and not `pinned` yet, turns to one that is not kept. What
+    would hang on nothing but an edge or a corner of what is not kept is pinned there."""
     links = matter.links.numpy()
     across = links[keep[links[:, 0]] != keep[links[:, 1]]]
     free = np.where(keep[across[:, 0]], across[:, 0], across[:, 1])
     fixed = across.sum(1) - free
+    among, m = links[keep[links].all(1)], len(keep)
+    cluster = sparse.csgraph.connected_components(
+        sparse.coo_matrix((np.ones(len(among), bool), among.T), shape=(m, m)), directed=False
+    )[1]
+    holds = np.zeros(m, bool)  # clusters that are pinned
+    holds[cluster[pinned & keep]] = True
     free, fixed = free[~pinned[free]], fixed[~pinned[free]]
     x, S = matter.position.numpy(), matter.moment.numpy()
     normal = x[free] - x[fixed]
     distance = np.linalg.norm(normal, axis=1)
-    # not along diagonals, unless there is nothing else
+    # not along diagonals, unless there is nothing else: a sliver that the sampling cut off would drift away
     edge = np.sqrt(12 * np.linalg.eigvalsh(S)[:, -1])
     near = distance < 1.25 * np.maximum(edge[free], edge[fixed])
-    if near.any():
-        free, fixed, normal, distance = free[near], fixed[near], normal[near], distance[near]
+    holds[cluster[free[near]]] = True
+    near |= ~holds[cluster[free]]
+    free, fixed, normal, distance = free[near], fixed[near], normal[near], distance[near]
     normal = normal / np.maximum(distance, 1e-30)[:, None]
     tangent = np.linalg.svd(normal[:, None])[2][:, 1:]  # [k, 2, 3]
     wide = np.sqrt(np.einsum("kti,kij,ktj->kt", tangent, S[free], tangent))

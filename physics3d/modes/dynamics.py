@@ -26,6 +26,7 @@ from scipy import linalg, sparse
 
 from physics3d.modes.stress import Points
 from physics3d.modes.vibration import STUCK, stiffness
+from physics3d.trajectory import NotMoved
 
 # of the last correction, of the largest first one of the run, in the norm of the matrix; by the precision asked for
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-11}
@@ -36,7 +37,7 @@ SHORTEST = 1e-3  # share of a Newton step
 LINEAR = 1e-6  # deformation in which the second order is lost
 
 
-class NotSolved(ValueError):
+class NotSolved(NotMoved):
     """Newton's method found no end of this step."""
 
 

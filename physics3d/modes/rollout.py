@@ -32,7 +32,7 @@ from physics3d.matter import Matter
 from physics3d.modes.dynamics import NotSolved, Step, System
 from physics3d.modes.model import MODES, QUADRATURE, Model, model
 from physics3d.modes.vibration import Mode
-from physics3d.trajectory import Trajectory
+from physics3d.trajectory import NotMoved, Trajectory
 from physics3d.world import World
 
 STEPS = 24  # in a period of the fastest mode that matters
@@ -338,7 +338,7 @@ class _Run:
             late = self._late(share, raised, length / count)
             count = math.ceil(count * min(max(math.sqrt(late / LATE), 1.0), MOST_FINER))
         if count > world.max_substeps:
-            raise ValueError(
+            raise NotMoved(
                 f"a frame would need {count} steps of {length / count:.3g} s, more than world.max_substeps = "
                 f"{world.max_substeps}; take a larger world.dt, shorter frames, or a larger max_substeps"
             )

@@ -29,6 +29,7 @@ from physics3d.mpm.problem import Problem
 from physics3d.mpm.state import State
 from physics3d.mpm.survey import Survey
 from physics3d.mpm.window import window
+from physics3d.trajectory import NotMoved
 
 TRIES = 6  # of one frame, each with twice the substeps
 
@@ -139,7 +140,7 @@ class Frames:
                 try:
                     side = self.implicit.reverse(adjoint, run.clock, 0, 1, side, run.node_velocity)
                 except NotConverged as reason:
-                    raise ValueError(f"frame {frame}, gradient: {reason}; take scheme='explicit'") from None
+                    raise NotMoved(f"frame {frame}, gradient: {reason}; take scheme='explicit'") from None
         adjoint.states[side].u.add_(adjoint_u[0])
         adjoint.states[side].H.add_(adjoint_F[0])
         assert self.initial is not None
@@ -199,9 +200,7 @@ class Frames:
         dt, t = frame_dt / count, (frame - 1) * frame_dt
         if fixed:
             remedy = f"world.dt < {dt / 2:g}, or {remedy}"
-        raise ValueError(
-            f"frame {frame}: {why} with substeps of {dt:g} s, {tried} tries from {t:g} s on; take {remedy}"
-        )
+        raise NotMoved(f"frame {frame}: {why} with substeps of {dt:g} s, {tried} tries from {t:g} s on; take {remedy}")
 
     def _choose(self, frame: int) -> None:
         """Make the coming frame implicit if the world wants that, or lets us and it pays."""
@@ -309,7 +308,7 @@ class Frames:
         if not self.now_implicit and dt > limit.dt:
             raise TooFast(limit.why, limit.remedy)
         if seen.outside:
-            raise ValueError(
+            raise NotMoved(
                 f"frame {frame}: {seen.outside} of {len(now.u)} particles left the simulated region "
                 f"{self.problem.corners()}; enlarge world.lower and world.upper, or add a BoundingBox or a HalfSpace"
             )

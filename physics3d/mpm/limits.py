@@ -20,6 +20,7 @@ from torch import Tensor
 
 from physics3d.mpm.state import State
 from physics3d.mpm.survey import Survey
+from physics3d.trajectory import NotMoved
 from physics3d.world import World
 
 # Explicit substeps that one implicit step has to replace before the automatic scheme takes it. Measured on one core, in
@@ -87,13 +88,13 @@ def implicit_need(world: World, now: State, frame_dt: float) -> int:
 def substeps_of_frame(
     world: World, now: State, limit: Limit, frame_dt: float, *, implicit: bool, last: int, frame: int
 ) -> int:
-    """Equal substeps of the coming frame, after one that had `last`. Raises ValueError where the user's dt is above the
+    """Equal substeps of the coming frame, after one that had `last`. Raises NotMoved where the user's dt is above the
     limit, or there are more of them than the world allows."""
     dt, most = world.dt, world.max_substeps
     if dt is not None:
         need = math.ceil(frame_dt / dt * (1 - 1e-9))
         if dt > limit.dt and not implicit:
-            raise ValueError(
+            raise NotMoved(
                 f"substep_dt is {dt:g} s, {limit.why} (frame {frame}); take world.dt < {limit.dt:.3g}, None for an "
                 "automatic one, or scheme='implicit'"
             )
@@ -109,7 +110,7 @@ def substeps_of_frame(
         why = limit.why
         if implicit:
             why, given = "particles move, turn or stretch too fast", "a weaker force or a slower start"
-        raise ValueError(
+        raise NotMoved(
             f"frame {frame} would need {need} substeps of {frame_dt / need:.3g} s, more than "
             f"world.max_substeps = {most}: {why}; take {given}, or a larger max_substeps"
         )

@@ -3,6 +3,7 @@
 import math
 
 from physics3d.mpm.survey import Survey
+from physics3d.trajectory import NotMoved
 from physics3d.world import World
 
 MOST_NODES = 2**27
@@ -12,7 +13,7 @@ def window(
     world: World, seen: Survey, *, steps: int, dt: float, reach: float, frame: int
 ) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Lowest node and number of nodes along each axis, with room for `reach` times the way particles can go in `steps`
-    substeps of dt [s]. Raises ValueError if they spread too far for a grid."""
+    substeps of dt [s]. Raises NotMoved if they spread too far for a grid."""
     duration = steps * dt
     speed = seen.speed + math.hypot(*world.gravity) * duration
     # a legal substep moves no particle farther than a cell, so no more room than that, however fast they are
@@ -21,5 +22,5 @@ def window(
     size = tuple(high + room + 1 - low for high, low in zip(seen.highest, lowest))
     if seen.infinite or math.prod(size) > MOST_NODES:
         across = " x ".join(f"{s:g}" for s in size)
-        raise ValueError(f"frame {frame}: the particles spread over {across} cells; take a larger dx or a BoundingBox")
+        raise NotMoved(f"frame {frame}: the particles spread over {across} cells; take a larger dx or a BoundingBox")
     return lowest, size

@@ -62,7 +62,7 @@ class CarnationTwin(AbstractSource):
     shear_relaxation_time: Duration = 0.15  # 1/k_d [s]
     bulk_relaxation_time: Duration = 0.15  # 1/k_v [s]
     density: Positive = 300.0  # petals hold much air [kg/m^3]
-    # how it moves: as was found once (`reference_motion.py`); where nothing is kept, by a grid finer than the pipeline's
+    # how it moves: as once found (`reference_motion.py`), or by a grid finer than the pipeline's where nothing is kept
     motion: str = "carnation"  # file of it
     dx: Length = 0.010  # cell of the grid [m]
     seed: Seed = 0

@@ -87,7 +87,7 @@ def floor_plane(
 def fullest_plane(
     points: Float64[np.ndarray, "n 3"], thickness: float, rng: np.random.Generator
 ) -> tuple[Float64[np.ndarray, "4"], Bool[np.ndarray, " n"]]:
-    """((n, d) of the plane n.x + d = 0 with the most points within `thickness`, which these are), of three points or more.
+    """((n, d) of the plane n.x + d = 0 with the most points within `thickness`, which these are), of three or more.
 
     Random sample consensus (Fischler and Bolles 1981), then least squares over the points found. Open3D has it as well,
     but on threads, and finds another plane each time.

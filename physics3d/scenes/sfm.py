@@ -88,7 +88,14 @@ def solve(
     _extract(pycolmap, database, images, names, log)
     if stills:
         _extract(pycolmap, database, images, sorted(stills), log)
-        _match(pycolmap, database, folder / "pairs.txt", [(s, n) for s in sorted(stills) for n in names], seed=seed, log=log)
+        _match(
+            pycolmap,
+            database,
+            folder / "pairs.txt",
+            [(s, n) for s in sorted(stills) for n in names],
+            seed=seed,
+            log=log,
+        )
         for still, clip in stills.items():  # before the many pairs of photographs are compared
             if not _compared(pycolmap, database, still):
                 raise _unplaced(clip, "not one photograph shows what it shows")

@@ -62,8 +62,8 @@ def captured(
     """A twin, photographed by `cameras` at rest and filmed by `witness` once for each role in `pokes`.
 
     `matter` is position [m] and volume [m^3] of the particles, by which the grid moves the body where no reference
-    motion of these `solids` is kept under the name `motion`, or else `name` (`reference_motion.py`); there are `points` surface points, `noise` [m] off along
-    each axis.
+    motion of these `solids` is kept under the name `motion`, or else `name` (`reference_motion.py`); there are `points`
+    surface points, `noise` [m] off along each axis.
     """
     images, alphas, found, colors = photographs(studio.pose(), cameras, points=points, noise=noise, seed=seed, log=log)
     position, volume = matter

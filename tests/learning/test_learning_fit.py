@@ -12,6 +12,7 @@ from physics3d.gaussians.carry import carry
 from physics3d.gaussians.sh import sh_color
 from physics3d.gaussians.splat import Numerics
 from physics3d.gaussians.twin import rasterize_plainly
+from physics3d.journal import Journal
 from physics3d.learning.fields import GlobalField
 from physics3d.learning.fit import fit, some_frames
 from physics3d.learning.linear import linearise, shown
@@ -20,6 +21,7 @@ from physics3d.learning.polish import polish
 from physics3d.learning.search import search
 from physics3d.log import Log
 from physics3d.priors.exemplar import Exemplar
+from physics3d.trajectory import NotMoved
 
 
 def toy(simulate=None) -> tuple[Chain, GlobalField]:
@@ -187,6 +189,58 @@ def test_a_valley_between_two_that_were_tried_is_found():
     offsets = (math.log(2) * torch.arange(-2, 3)).tolist()
     theta, _ = search(chain, field, torch.ones(1).double(), offsets, seed=0, log=Log(None))
     assert float(theta) == pytest.approx(math.log(2) / 2)
+
+
+def immovable(where):
+    """`seen_as` a slope, from a start 100 times too stiff, of which nothing moves the body `where` E is so."""
+    chain, field = seen_as(lambda lnE: 0.02 * lnE, 100.0)
+
+    def simulate(theta):
+        if where(field.parameters(theta)["youngs_modulus"].item()):
+            raise NotMoved("frame 6: 1 of 11336 particles left the simulated region; enlarge world.lower")
+        return chain.simulate(theta)
+
+    return replace(chain, simulate=simulate), field
+
+
+def test_a_search_passes_over_what_cannot_be_moved_and_says_so(tmp_path):
+    """Too soft from a tenth of the answer on, and the start itself too stiff."""
+    chain, field = immovable(lambda E: E < 0.1 or E > 60)
+    chain = replace(chain, journal=Journal(Log(tmp_path, quiet=True)))
+    offsets = (math.log(4) * torch.arange(-2, 3)).tolist()
+    theta, course = search(chain, field, torch.ones(1).double(), offsets, seed=0, log=Log(None))
+    assert abs(math.log(100 * math.exp(float(theta)))) <= 0.5 * math.log(4) + 1e-6
+    assert any(math.isinf(point.loss) for point in course)
+    said = (tmp_path / "log.txt").read_text()
+    assert "cannot be moved (frame 6: 1 of 11336 particles left the simulated region)" in said
+    there, _ = fit(chain, field, theta, **OPTIONS)
+    assert float(field.parameters(there)["youngs_modulus"]) == pytest.approx(1.0, rel=0.02)
+
+
+def test_where_nothing_moves_the_body_it_is_said_why():
+    chain, field = immovable(lambda E: True)
+    with pytest.raises(NotMoved, match=r"enlarge world\.lower"):
+        search(chain, field, torch.ones(1).double(), [-1.0, 0.0, 1.0], seed=0, log=Log(None))
+
+
+def test_a_descent_and_a_polish_step_back_from_what_cannot_be_moved():
+    """The answer lies where nothing moves the body: both end beside it."""
+    chain, field = immovable(lambda E: E < 30)
+    theta, _ = fit(chain, field, field.zero(), **OPTIONS)
+    assert 30 <= float(field.parameters(theta)["youngs_modulus"]) < 60
+    theta, _ = polish(chain, field, field.zero(), steps=20, stay=0.0, seed=0, log=Log(None))
+    assert 30 <= float(field.parameters(theta)["youngs_modulus"]) < 60
+
+
+@pytest.mark.parametrize("blurred", [False, True])
+def test_a_poor_picture_of_what_stands_still_is_no_reason_to_look_on(blurred, tmp_path):
+    """The valley is a wide one, and found; stripes that all pictures lack are most of what is left of the loss."""
+    chain, field = seen_as(lambda lnE: 0.05 * lnE, 4.0)
+    if blurred:
+        chain = replace(chain, clips={0: chain.clips[0] + 0.2 * torch.tensor([1.0, -1.0, 1.0, -1.0])[:, None]})
+    offsets = (math.log(2) * torch.arange(-3, 4)).tolist()
+    search(chain, field, torch.ones(1).double(), offsets, seed=0, log=Log(tmp_path, quiet=True))
+    assert "looking between" not in (tmp_path / "log.txt").read_text()
 
 
 def test_the_search_ends_at_the_span(tmp_path):

@@ -8,6 +8,7 @@ import torch
 from modes_bodies import row, section, timoshenko, turned_beam, world
 
 from physics3d.boundaries.fixed_region import FixedRegion
+from physics3d.boundaries.held_particles import HeldParticles
 from physics3d.log import Log
 from physics3d.materials.mixture import PART, Mixture
 from physics3d.materials.neo_hookean import NeoHookean
@@ -55,6 +56,18 @@ def test_a_box_holds_wherever_its_face_runs():
         found.append(frequencies(solver)[0] * (0.12 - face) ** 2)
     # a gap belongs to neither side: 2.1 mm of 90 is 5 % of f L^2
     np.testing.assert_allclose(found, np.mean(found), rtol=0.1)
+
+
+def test_a_sliver_that_hangs_on_a_corner_of_what_is_held_is_held():
+    """Behind the first cubes of a beam, which are held, and beside them, as sampling leaves one: it is no part of what
+    swings. Left to itself it drifts, and the first frequencies are its."""
+    position, volume = row(12, 0.01)
+    behind = position.new_tensor([[-0.007, 0.0, 0.0075]])
+    held = world(1e5, 0.3, boundaries=(HeldParticles(position=position[:2]),))
+    alone = frequencies(Solver.of(held, position, volume, log=Log(None)))
+    both = torch.cat([position, behind]), torch.cat([volume, volume.new_tensor([1e-9])])
+    found = frequencies(Solver.of(held, *both, log=Log(None)))
+    np.testing.assert_allclose(found[:4], alone[:4], rtol=1e-3)  # of what the smaller mean spacing changes
 
 
 def test_a_free_body_has_six_rigid_motions():
