@@ -14,13 +14,16 @@ page. Exit codes: 0 all done, 1 a variant failed, 2 the command line is wrong, 1
 """
 
 import csv
+import ctypes
 import itertools
 import logging
+import multiprocessing
 import queue
 import re
 import signal
 import socket
 import sys
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor
@@ -271,6 +274,9 @@ class _Work:
                         with suppress(WorkerDied):
                             self._take(*ended.get())
                     raise
+                except BaseException:  # Ctrl-C, or what Prefect makes of SIGTERM
+                    interrupt_all()
+                    raise
 
         sweep()
 
@@ -307,6 +313,19 @@ class _Work:
             if isinstance(error, BrokenExecutor) or type(error).__name__ in ("KilledWorker", "WorkerCrashedError"):
                 raise WorkerDied(f"at {step.name}") from error
             self.failed[step.folder] = " ".join(str(error).split()) or type(error).__name__
+
+
+def interrupt_all() -> None:
+    """What threads and processes of this one compute ends as well: their pools wait for them, and a stage takes minutes.
+    It goes on from its checkpoint when it is asked for again."""
+    for thread in threading.enumerate():
+        frame = sys._current_frames().get(thread.ident or 0)
+        waits = frame is None or frame.f_code.co_name == "_worker"  # for work: its pool wakes it
+        if thread.name.startswith("ThreadPoolExecutor") and not waits:
+            stop = ctypes.py_object(KeyboardInterrupt)
+            ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread.ident), stop)
+    for process in multiprocessing.active_children():
+        process.kill()
 
 
 def _write(table: Path, rows: list[dict[str, Any]]) -> None:

@@ -4,6 +4,8 @@ import csv
 import os
 import signal
 import sqlite3
+import subprocess
+import sys
 import threading
 import time
 from collections import Counter
@@ -84,6 +86,37 @@ def test_a_worker_killed_in_the_middle_loses_nothing(folder, prefect, runner, mo
         assert sorted(record.execute(query).fetchall()) == [("toy m0", "FINISHED"), ("toy m1", "FINISHED")]
         (name,) = {value for (value,) in record.execute("select value from tags where key = 'sweep'")}
     assert f"searchFilter=tags.sweep%20%3D%20%27{name}%27" in out, "one page shows both"
+
+
+@pytest.mark.parametrize("runner", ["thread", "process", "dask", pytest.param("ray", marks=WITH_RAY)])
+def test_an_interrupt_stops_what_is_under_way_and_keeps_what_is_finished(folder, prefect, runner):
+    """A stage that would go on for ever, wherever it is computed; SIGTERM for the command alone, as a cluster does."""
+    (folder / "stop in learn").touch()
+    code = (
+        "import sys; from pathlib import Path; from test_sweep import variants;"
+        "from pipeline.filed import one_line; from pipeline.sweep import Crew, run;"
+        f"crew = Crew(runner={runner!r}, workers=2, address='');"
+        "work = lambda: run(crew, variants(Path(sys.argv[1]), [{}]));"
+        "sys.exit(one_line(work, lambda said: print(said, file=sys.stderr))) if __name__ == '__main__' else None"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, str(folder)],
+        env=prefect,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    while not (folder / "processes in learn").exists():
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.05)
+    process.terminate()
+    _, err = process.communicate(timeout=120)  # for ever, where it waits for the stage
+    assert process.returncode == 130 and "interrupted" in err
+    at_work = {int(pid) for pid in (folder / "processes in learn").read_text().split()} - {process.pid}
+    while any(Path(f"/proc/{pid}").exists() for pid in at_work):
+        time.sleep(0.05)
+    assert not list((folder / "artifacts" / "learn").glob("[!.]*"))
+    assert len(list((folder / "artifacts" / "fill").glob("[!.]*"))) == 1
 
 
 def test_what_variants_share_is_computed_once_and_one_that_fails_stops_no_other(folder, prefect, capsys):
