@@ -316,7 +316,7 @@ class _Work:
 
 
 def interrupt_all() -> None:
-    """What threads and processes of this one compute ends as well: their pools wait for them, and a stage takes minutes.
+    """What threads and processes compute for this one ends as well: pools wait for them, and a stage takes minutes.
     It goes on from its checkpoint when it is asked for again."""
     for thread in threading.enumerate():
         frame = sys._current_frames().get(thread.ident or 0)
