@@ -52,12 +52,12 @@ class Constraints:
         self.groups: Groups | None = None  # P where nothing but these acts
         momentum = system.momentum
         if system.coupled and not system.launches.arrays.mirrored:
-            x = torch.rand(momentum.shape, dtype=momentum.dtype, device=momentum.device) - 0.5
+            x = _anything(momentum, 1)[0]
             groups, there = Groups(system), self._pull(x)
             if float((groups(x) - there).abs().max()) <= 100 * system.rounding * float(there.abs().max()):
                 self.groups = groups
         if system.coupled and self.groups is None:
-            x = torch.rand((2, *momentum.shape), dtype=momentum.dtype, device=momentum.device) - 0.5
+            x = _anything(momentum, 2)
             images = [self.derivative(y) for y in x]
             off = abs(dot(system.mass * x[0], images[1]) - dot(system.mass * x[1], images[0]))
             off += abs(dot(system.mass * x[0], self.derivative(images[1]) - images[1]))
@@ -106,3 +106,9 @@ class Constraints:
             ends.append(system.update(gravity=system.falls))
         system.grid.copy_(there)
         return (ends[0] - ends[1]) / (2 * h) if h > 0 else torch.zeros_like(x)
+
+
+def _anything(like: Tensor, count: int) -> Tensor:
+    """Vectors to try P with, the same at every call: whatever was computed before must not matter."""
+    generator = torch.Generator(like.device).manual_seed(0)
+    return torch.rand((count, *like.shape), dtype=like.dtype, device=like.device, generator=generator) - 0.5
