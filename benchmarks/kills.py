@@ -125,7 +125,8 @@ def killed_throughout(stage: str, words: list[str], output: Path) -> dict[str, s
         assert not different, f"{stage}: {different} are not those of the run that nobody killed"
     again = max(took + sum(losses) - turns * seconds, 0.0) / len(losses)
     numbers = dict(seconds=seconds, kills=len(losses), most_lost=max(losses), again=again)
-    return dict(run=" ".join(words), stage=stage) | {name: f"{value:.3g}" for name, value in numbers.items()}
+    said = " ".join(word for word in words if not word.startswith(("data=", "output=")))  # those are of one machine
+    return dict(run=said, stage=stage) | {name: f"{value:.3g}" for name, value in numbers.items()}
 
 
 def files(folder: Path) -> dict[str, bytes]:
