@@ -100,7 +100,8 @@ def attempt(stage: str, words: list[str], output: Path, after: float) -> float |
     process.wait()
     lost = time.monotonic() - last
     assert lost < MOST, f"{lost:.0f} s of work in {stage} are lost"
-    assert not list(shelf.glob("[!.]*")), f"{stage} passes for finished"
+    if finished(output).keys() & set(shelf.iterdir()):  # in the last moment
+        return None
     return lost
 
 
