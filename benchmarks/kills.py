@@ -89,8 +89,8 @@ def attempt(stage: str, words: list[str], output: Path, after: float) -> float |
             return None
         if ended:
             sys.exit(f"{stage} was not begun:\n{lines.read_text()[-2000:]}")
-        said = lines.read_text()[told:] if lines.exists() else ""
-        if begun is None and any(shelf.glob(".*")) and (not after or f"{stage} |" in said):
+        said = lines.read_bytes()[told:] if lines.exists() else b""
+        if begun is None and any(shelf.glob(".*")) and (not after or f"{stage} |".encode() in said):
             begun = last = time.monotonic()
         for path in shelf.glob(f".*/{CHECKPOINT}"):
             if (now := path.stat().st_ino) != kept and begun:  # it is never changed, only replaced
