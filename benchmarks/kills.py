@@ -111,7 +111,7 @@ def killed_throughout(stage: str, words: list[str], output: Path) -> dict[str, s
     aside = output / f"{stage}, not killed"
     shutil.copytree(filed, aside)
     seconds, rng = read_manifest(aside)["seconds"], random.Random(0)
-    longest = max(2 * seconds / KILLS, 10.0)  # a run that is killed again at once gets nowhere
+    longest = max(2 * seconds / KILLS, min(seconds, 10.0))  # a run that is killed again at once gets nowhere
     losses: list[float] = []
     took = 0.0
     turns = 0

@@ -12,6 +12,7 @@ designed to discriminate: Atkinson and Fedorov 1975.)
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -79,7 +80,7 @@ def rise(
     places = (tie.theta, *(tie.theta + STEP * torch.eye(len(tie.theta), dtype=tie.theta.dtype)))
     A, b, c, pixels = np.zeros_like(JJ), np.zeros(len(JJ)), 0.0, 0
     motions = [
-        chain.noted("recorded", at, made=lambda at=at: simulate(at))
+        chain.noted("recorded", at, made=partial(simulate, at))
         for at in (theta, *(tie.model.whole(place) for place in places))
     ]
     with torch.no_grad():

@@ -5,6 +5,7 @@ For priors whose estimate does not depend on the noise: z0 - x0_hat is then a re
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -55,7 +56,7 @@ def _linearised(chain: Chain, theta: Tensor, seed: int, step: float) -> tuple[Te
         return seen.weight * seen.J.T @ seen.J, seen.weight * seen.J.T @ seen.r
 
     for view in chain.clips:
-        one, other = chain.journal.ask("view", view, answer=lambda view=view: added(view))
+        one, other = chain.journal.ask("view", view, answer=partial(added, view))
         JJ, Jr = JJ + one, Jr + other
     return JJ / pixels, Jr / pixels
 
@@ -94,7 +95,7 @@ def _shown(chain: Chain, theta: Tensor, seed: int, step: float) -> dict[str, Any
         score, share = _in_blocks(_gradient(chain, seen), changes)
         return dict(JJ=seen.weight * J.T @ J, squares=(J**2).sum(0), count=len(J), score=score, share=share)
 
-    told = [chain.journal.ask("view", view, answer=lambda view=view: added(view)) for view in chain.clips]
+    told = [chain.journal.ask("view", view, answer=partial(added, view)) for view in chain.clips]
     JJ, squares = sum(one["JJ"] for one in told), sum(one["squares"] for one in told)
     count, scores, shares = (sum(one["count"] for one in told), [o["score"] for o in told], [o["share"] for o in told])
     push = np.linalg.pinv(JJ[:k, :k], hermitian=True) @ JJ[:k, k] if len(JJ) > k else np.zeros(k)
@@ -143,7 +144,7 @@ def _apart(chain: Chain, theta: Tensor, others: Sequence[Tensor], seed: int) -> 
             found.append(dict(square=square, score=score, share=share))
         return found
 
-    told = [chain.journal.ask("view", view, answer=lambda view=view: added(view)) for view in chain.clips]
+    told = [chain.journal.ask("view", view, answer=partial(added, view)) for view in chain.clips]
     return [
         dict(
             JJ=np.full((1, 1), sum(one["square"] for one in views)),
