@@ -167,15 +167,18 @@ def through(words: list[str], output: Path) -> None:
     assert b"up to date" in again.stdout
 
 
-def page(rows: list[dict[str, str]]) -> None:
-    """The table of all runs so far, and its page."""
-    with (RESULTS / "kills.csv").open("w", newline="") as table:
-        writer = csv.DictWriter(table, COLUMNS)
+def page(found: list[dict[str, str]]) -> None:
+    """The table of all runs so far, the same run taken out, and its page."""
+    table = RESULTS / "kills.csv"
+    with table.open(newline="") if table.is_file() else nullcontext(()) as before:
+        rows = [row for row in csv.DictReader(before) if row["run"] != found[0]["run"]] + found
+    with table.open("w", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS)
         writer.writeheader()
         writer.writerows(rows)
     lines = ["# Kills", "", "Made by `make bench-kills`, a run at a time: ARGS are those of the column.", ""]
     lines += [f"Machine: {machine('cpu')}, load {os.getloadavg()[0]:.0f} at the end of the last of them.", ""]
-    lines += [*textwrap.wrap(WHAT, 160), ""]
+    lines += [*textwrap.wrap(WHAT.strip(), 160), ""]
     lines += [
         "| run | stage | seconds | kills | most that was lost [s] | done again [s per kill] |",
         "|---|---|---|---|---|---|",
@@ -193,12 +196,8 @@ def main(words: list[str]) -> None:
         through(words, straight)
         stages = [stage for stage in STAGES if any((straight / "artifacts" / stage).glob("[!.]*"))]
         print(f"{'killed in':>12} {'after':>8} {'lost':>8}", flush=True)
-        rows = [killed_throughout(stage, words, straight) for stage in LONG if stage in stages]
+        page([killed_throughout(stage, words, straight) for stage in LONG if stage in stages])
         killed_in_each(stages, words, broken)
-    table = RESULTS / "kills.csv"
-    with table.open(newline="") if table.is_file() else nullcontext(()) as before:
-        others = [row for row in csv.DictReader(before) if row["run"] != rows[0]["run"]]
-    page([*others, *rows])
     print("no result lost, none computed twice, the same bytes")
 
 
