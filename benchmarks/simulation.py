@@ -9,8 +9,8 @@ explicit limit where waves are what limits it. `modes` is the solver without a g
 building of its model in the time: of a cantilever of the same particles, and of the viscoelastic bar without Poisson's
 ratio (tests/modes/modes_bodies.py), which needs no walls; its cells are pieces along the bar. The error is the relative
 error of what the problem is about; for the shear start-up, which has no grid, that of the final tau_12 and N1. The time
-is wall clock on one thread, kernels compiled before: the median of three runs, or one run where that takes over two
-seconds. A run with a fixed substep beyond the stable limit must be refused.
+is that of the processor, on one thread, kernels compiled before: the median of three runs, or one run where that takes
+over two seconds. A run with a fixed substep beyond the stable limit must be refused.
 """
 
 import csv
@@ -139,9 +139,9 @@ def measure(run: Callable[[], Answer], **row) -> dict:
     row |= dict(substeps=0, error=math.nan, seconds=math.nan, outcome="refused", reason="")
     times: list[float] = []
     while len(times) < (3 if not times or times[0] < 2 else 1):
-        start = time.perf_counter()
+        start = time.process_time()
         answer, row["reason"] = attempt(run)
-        times.append(time.perf_counter() - start)
+        times.append(time.process_time() - start)
         if answer is None:
             break
         row |= dict(outcome="ran" if math.isfinite(answer.error) else "FAILED", substeps=answer.substeps)
@@ -186,7 +186,7 @@ def write_again() -> None:
     rows = read()
     page_of = RESULTS / "simulation.md"
     head = next(line for line in page_of.read_text().splitlines() if line.startswith("Machine: "))
-    title = head.removeprefix("Machine: ").partition(". Shared")[0]
+    title = head.removeprefix("Machine: ").partition(". Busy")[0]
     earlier = next((line for line in page_of.read_text().splitlines() if line.startswith("Of an earlier run")), "")
     kept = earlier.rstrip(".").partition(": ")[2].split(", ") if earlier else []
     mark_front(rows)
@@ -263,7 +263,7 @@ def draw(rows: list[dict], title: str) -> None:
         axis.title.set_size(9)
     for axis in axes[len(problems) :]:
         axis.set_axis_off()
-    figure.supxlabel("wall clock [s]", fontsize=9)
+    figure.supxlabel("processor time [s]", fontsize=9)
     figure.supylabel("relative error", fontsize=9)
     from matplotlib.lines import Line2D
 
@@ -279,9 +279,9 @@ def draw(rows: list[dict], title: str) -> None:
 def page(rows: list[dict], title: str, kept: list[str]) -> str:
     """The results as a page. What it says of them is computed from them."""
     lines = ["# Simulation: error against run time", "", "Made by `make bench-simulation`. No random numbers.", ""]
-    if kept:
-        lines += [f"Of an earlier run, perhaps of another machine: {', '.join(kept)}.", ""]
-    lines += [f"Machine: {title}. Shared with other work: compare times within this page only.", ""]
+    if kept:  # the first such runs looked at the clock on the wall
+        lines += [f"Of an earlier run, perhaps of another machine, by wall clock: {', '.join(kept)}.", ""]
+    lines += [f"Machine: {title}. Busy with other work: compare times within this page only.", ""]
     lines += [*__doc__.split("\n\n", 2)[2].strip().splitlines(), "", "![error against time](simulation.png)", ""]
     lines += ["Numbers beside points are cells.", "", "## What it shows", ""]
     lines += [f"- {sentence}" for sentence in findings(rows)]

@@ -4,45 +4,76 @@ What is asked is computed once and noted. Stopped and called again, the computat
 what was noted, so that in moments it comes, by the same path, to where it was: nothing else of it needs to be kept, not
 the state of an optimiser, not even of scipy's. Every answer stands behind a digest of its question; where another one
 is asked than was noted, what follows is forgotten. Curves are logged again from the beginning.
+
+Whoever answers may ask in turn, so that of a long answer little is lost as well. These answers, which may be large, are
+kept until the one that they are for is known. An answer is handed out as it will be told after a stop, laid out in
+memory alike: the order of an array's axes decides how its sums are rounded.
 """
 
 import hashlib
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 import torch
 
+from physics3d.artifact import decode, encode
 from physics3d.checkpoint import Checkpoint
 from physics3d.log import Log
 
 
+@dataclass
+class Book:
+    """What is written in a journal."""
+
+    checkpoint: Checkpoint
+    # [digest of the question whose answer is sought, [digests of those asked for it, with answers]], outermost first
+    levels: list[list[Any]]
+    told: list[int] = field(default_factory=lambda: [0])  # how many were told or noted by now, of each level
+
+
 class Journal:
-    """That of the computation which `log` tells of."""
+    """That of the computation which `log` tells of: there is one, whoever opens it."""
 
     def __init__(self, log: Log):
         self.log = log
-        self.checkpoint = Checkpoint(log)
-        self.noted: list[list[Any]] = self.checkpoint.load(curves=False) or []  # digests of questions, and answers
-        self.told = 0  # how many of them were asked for
+        if log.book is None:
+            checkpoint = Checkpoint(log)
+            log.book = Book(checkpoint=checkpoint, levels=checkpoint.load(curves=False) or [["", []]])
+        self.book: Book = log.book
 
     def ask(self, *question: Any, answer: Callable[[], Any]) -> Any:
-        """What `answer` returns, now or when it was noted: made of what a checkpoint may hold, never changed by whoever
-        gets it. A `question` is text, numbers and tensors."""
-        key = _digest(question)
-        if self.told < len(self.noted) and self.noted[self.told][0] == key:
-            self.told += 1
-            return self.noted[self.told - 1][1]
-        if self.told < len(self.noted):
-            self.log.warn(f"it takes another path than before it was stopped, from evaluation {self.told + 1} on")
-        self.noted[self.told :] = [[key, answer()]]
-        self.told += 1
-        self.checkpoint.save(self.noted, f"after evaluation {self.told}")
-        return self.noted[-1][1]
+        """What `answer` returns, now or when it was noted: made of what a checkpoint may hold, on the CPU, never
+        changed by whoever gets it. A `question` is text, numbers, tensors and arrays."""
+        levels, told, key = self.book.levels, self.book.told, _digest(question)
+        depth = len(told) - 1
+        noted, count = levels[depth][1], told[depth]
+        if count < len(noted) and noted[count][0] == key:
+            told[depth] += 1
+            return noted[count][1]
+        if count < len(noted):
+            self.log.warn(f"it takes another path than before it was stopped, from evaluation {count + 1} on")
+            del noted[count:]
+        if [level[0] for level in levels[depth + 1 : depth + 2]] != [key]:
+            levels[depth + 1 :] = [[key, []]]
+        told.append(0)
+        try:
+            made = decode(*encode(answer()))
+        finally:
+            told.pop()
+        del levels[depth + 1 :]
+        noted.append([key, made])
+        told[depth] += 1
+        self.book.checkpoint.save(levels, f"after evaluation {'.'.join(map(str, told))}")
+        return made
 
 
 def _digest(question: tuple[Any, ...]) -> str:
     essence = hashlib.sha256()
     for part in question:
+        if isinstance(part, np.ndarray):
+            part = torch.from_numpy(np.ascontiguousarray(part))
         if isinstance(part, torch.Tensor):
             part = (str(part.dtype), tuple(part.shape), part.detach().cpu().contiguous().numpy().tobytes())
         essence.update(repr(part).encode() + b"\n")

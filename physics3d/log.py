@@ -29,7 +29,14 @@ class Log:
         self.name = name
         self.quiet = quiet or folder is None
         self.said = set() if said is None else said
+        self.book: Any = None  # of its journal (`journal.py`), once that is opened
         self.started = time.monotonic()
+
+    def hushed(self) -> "Log":
+        """One that tells nothing, of the same computation: what is noted goes into the same journal."""
+        quiet = Log(None)
+        quiet.book = self.book
+        return quiet
 
     def info(self, text: str) -> None:
         """One line for the person watching; kept in log.txt."""

@@ -233,8 +233,7 @@ class Learn:
                 said = self.said(finer, seen, log)
                 known = {name: [*known.get(name, []), *curve] for name, curve in history(finer, descent).items()}
         beyond = self.beyond.of(section, self.world.dx, on_grid=chain.on_grid)
-        with torch.no_grad():
-            omega = angular_frequency(chain.simulate(theta))
+        omega = self.swing(chain, theta)
         equal, models, recordings = self.alike(chain, field, theta, seen, omega, course, log)
         learned = replace(
             start,
@@ -287,8 +286,7 @@ class Learn:
     ) -> tuple[Tensor, list[Point]]:
         """The better one of theta, where a polish with these points ended, and the end of one that begins across from
         it, in the other valley of the relaxation time; with both courses."""
-        with torch.no_grad():
-            places = across(field, theta, angular_frequency(chain.simulate(theta)))
+        places = across(field, theta, self.swing(chain, theta))
         if not places:
             return theta, points
         there = places[0] if len(places) == 1 else min(places, key=lambda place: chain.tried(place, self.seed))
@@ -304,6 +302,11 @@ class Learn:
             return better.theta, [*points, *more, replace(better, way="polish")]
         log.info(f"{time(better.theta):.3g} s explain the clip better: loss {better.loss:.5g}, not {worse.loss:.5g}")
         return better.theta, [*points, *more, worse, replace(better, way="polish")]
+
+    def swing(self, chain: Chain, theta: Tensor) -> float:
+        """Angular frequency [1/s] of the motion at theta."""
+        answer = lambda: angular_frequency(chain.motion(theta))
+        return chain.journal.ask("angular frequency", theta, answer=answer)
 
     def alike(
         self,

@@ -1,4 +1,5 @@
-"""A log whose owner loses patience: the bars of a computation end with Ctrl-C after so many items, of all together."""
+"""A log whose owner loses patience: the bars of a computation end with Ctrl-C after so many items, of all together, or
+at a line that begins with some words."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -8,9 +9,14 @@ from physics3d.log import Log
 
 
 class Interrupted(Log):
-    def __init__(self, folder: Path, after: int):
+    def __init__(self, folder: Path, after: int | str):
         super().__init__(folder, quiet=True)
         self.after = after
+
+    def info(self, text: str) -> None:
+        super().info(text)
+        if isinstance(self.after, str) and text.startswith(self.after):
+            raise KeyboardInterrupt
 
     def progress(self, items: Iterable | None, description: str, total: int | None = None, done: int = 0) -> Any:
         return super().progress(self._until(items or ()), description, total, done)
@@ -19,5 +25,6 @@ class Interrupted(Log):
         for item in items:
             if self.after == 0:
                 raise KeyboardInterrupt
-            self.after -= 1
+            if isinstance(self.after, int):
+                self.after -= 1
             yield item

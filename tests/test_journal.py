@@ -1,6 +1,7 @@
 """What a journal is asked is answered once, by the path that was taken."""
 
 import numpy as np
+import pytest
 import torch
 from scipy import optimize
 
@@ -52,6 +53,58 @@ def test_answers_to_other_questions_are_forgotten(tmp_path, monkeypatch):
     assert torch.equal(again.ask("thrice", two, answer=lambda: 3 * two), 3 * two)  # another question
     assert torch.equal(again.ask("twice", one, answer=lambda: 4 * one), 4 * one), "what came after it is computed anew"
     assert "takes another path" in (tmp_path / "log.txt").read_text()
+
+
+def test_of_a_long_answer_what_it_asked_for_is_kept_until_it_is_known(tmp_path, monkeypatch):
+    """Sums of products, two levels deep, stopped before each product in turn: none is computed twice."""
+    monkeypatch.setattr(physics3d.checkpoint, "LONGEST", 0.0)
+    computed: list[tuple[int, int]] = []
+
+    def table(folder, most: int) -> list[int]:
+        journal = Journal(Log(folder, quiet=True))
+
+        def product(i: int, j: int) -> int:
+            if len(computed) == most:
+                raise KeyboardInterrupt
+            computed.append((i, j))
+            return i * j
+
+        def row(i: int) -> int:
+            # another computation may open the journal as well
+            ask = Journal(journal.log).ask
+            return sum(ask("product", j, answer=lambda j=j: product(i, j)) for j in range(3))
+
+        return [journal.ask("row", i, answer=lambda i=i: row(i)) for i in range(4)]
+
+    for most in range(12):
+        with pytest.raises(KeyboardInterrupt):
+            table(tmp_path, most)
+    # rows ask the same questions: of another row the answers do not count
+    assert table(tmp_path, 12) == [3 * i for i in range(4)]
+    assert computed == [(i, j) for i in range(4) for j in range(3)]
+    assert table(tmp_path, 12) == [3 * i for i in range(4)], "all of it is known"
+    assert len(Journal(Log(tmp_path, quiet=True)).book.levels) == 1, "and what only led to it is forgotten"
+
+
+def test_an_answer_is_laid_out_as_it_will_be_after_a_stop(tmp_path, monkeypatch):
+    """Sums of an array are rounded by the order of its axes in memory: it has to be one order."""
+    monkeypatch.setattr(physics3d.checkpoint, "LONGEST", 0.0)
+    x = np.random.default_rng(0).standard_normal((40, 30, 20))
+    answer = lambda: dict(array=x.transpose(2, 1, 0), tensor=torch.from_numpy(x).permute(1, 2, 0))
+    first = Journal(Log(tmp_path, quiet=True)).ask("turned", answer=answer)
+    again = Journal(Log(tmp_path, quiet=True)).ask("turned", answer=answer)
+    assert np.array_equal(first["array"], x.transpose(2, 1, 0))
+    assert first["array"].strides == again["array"].strides and first["tensor"].stride() == again["tensor"].stride()
+    assert first["array"].sum((0, 1)).tolist() == again["array"].sum((0, 1)).tolist()
+
+
+def test_arrays_that_differ_in_one_number_are_other_questions():
+    journal, x = Journal(Log(None)), np.zeros(5000)
+    y = x.copy()
+    y[2500] = 1.0  # where a printed array has dots
+    journal.ask("array", x, answer=lambda: 0)
+    journal.book.told = [0]  # from the beginning
+    assert journal.ask("array", y, answer=lambda: 1) == 1
 
 
 def pytest_fail():

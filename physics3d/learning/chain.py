@@ -96,7 +96,7 @@ def chain_of(
     def staged(excitation: tuple[AbstractBoundary, ...], times: float):
         def made():
             slower = timing | dict(frame_dt=times * timing["frame_dt"])
-            other = motion if excitation == take.excitation else moved(excitation, Log(None))
+            other = motion if excitation == take.excitation else moved(excitation, log.hushed())
             return lambda theta: other(
                 part(field.parameters(theta)), velocity=field.velocity(theta), log=Log(None), **slower
             )

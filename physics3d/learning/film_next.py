@@ -12,6 +12,7 @@ designed to discriminate: Atkinson and Fedorov 1975.)
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -83,8 +84,11 @@ def rise(
     `simulate` makes its motions by the theta of the whole; `JJ` is the first clip's (`Linear`)."""
     places = (tie.theta, *(tie.theta + STEP * torch.eye(len(tie.theta), dtype=tie.theta.dtype)))
     A, b, c, pixels = np.zeros_like(JJ), np.zeros(len(JJ)), 0.0, 0
+    motions = [
+        chain.noted("recorded", at, made=partial(simulate, at))
+        for at in (theta, *(tie.model.whole(place) for place in places))
+    ]
     with torch.no_grad():
-        motions = [simulate(theta), *(simulate(tie.model.whole(place)) for place in places)]
         for view in chain.clips:
             first, code, _, w = asked(chain, motions[0], view, seed)
             others = [chain.prior.encode(chain.render(motion, view, chain.frames)) for motion in motions[1:]]

@@ -3,8 +3,9 @@
 For priors whose estimate does not depend on the noise: z0 - x0_hat is then a residual, as of any fit of a recording.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -48,8 +49,15 @@ def _linearised(chain: Chain, theta: Tensor, seed: int, step: float) -> tuple[Te
     k = len(theta)
     JJ, Jr = torch.zeros(k, k).double(), torch.zeros(k).double()
     pixels = sum(clip.numel() for clip in chain.clips.values())
-    for seen in _around(chain, _motions(chain, theta, step), seed, step):
-        JJ, Jr = JJ + seen.weight * seen.J.T @ seen.J, Jr + seen.weight * seen.J.T @ seen.r
+    motions = _motions(chain, theta, step)
+
+    def added(view: int) -> tuple[Tensor, Tensor]:
+        seen = _around(chain, motions, view, seed, step)
+        return seen.weight * seen.J.T @ seen.J, seen.weight * seen.J.T @ seen.r
+
+    for view in chain.clips:
+        one, other = chain.journal.ask("view", view, answer=partial(added, view))
+        JJ, Jr = JJ + one, Jr + other
     return JJ / pixels, Jr / pixels
 
 
@@ -76,19 +84,20 @@ def shown(chain: Chain, field: AbstractField, theta: Tensor, *, seed: int, step:
 def _shown(chain: Chain, theta: Tensor, seed: int, step: float) -> dict[str, Any]:
     k = len(theta)
     motions = _motions(chain, theta, step)
-    if chain.pushed is not None:
-        with torch.no_grad():
-            motions.append(chain.pushed(theta, step))
-    JJ, squares, count = np.zeros((len(motions) - 1,) * 2), np.zeros(len(motions) - 1), 0
-    scores, shares = [], []
-    for seen in _around(chain, motions, seed, step):
+    if (pushed := chain.pushed) is not None:
+        motions.append(chain.noted("pushed", theta, step, made=lambda: pushed(theta, step)))
+
+    def added(view: int) -> dict[str, Any]:
+        seen = _around(chain, motions, view, seed, step)
         J = seen.J.numpy()
-        JJ, squares, count = JJ + seen.weight * J.T @ J, squares + (J**2).sum(0), count + len(J)
         first, *beside = seen.videos[: k + 1]
         changes = ((video - first).double().cpu().numpy() / step for video in beside)
         score, share = _in_blocks(_gradient(chain, seen), changes)
-        scores.append(score)
-        shares.append(share)
+        return dict(JJ=seen.weight * J.T @ J, squares=(J**2).sum(0), count=len(J), score=score, share=share)
+
+    told = [chain.journal.ask("view", view, answer=partial(added, view)) for view in chain.clips]
+    JJ, squares = sum(one["JJ"] for one in told), sum(one["squares"] for one in told)
+    count, scores, shares = (sum(one["count"] for one in told), [o["score"] for o in told], [o["share"] for o in told])
     push = np.linalg.pinv(JJ[:k, :k], hermitian=True) @ JJ[:k, k] if len(JJ) > k else np.zeros(k)
     evidence = dict(JJ=JJ[:k, :k].copy(), score=np.concatenate(scores, 1), share=np.concatenate(shares, 1))
     return dict(evidence=evidence, push=push, rms=np.sqrt(squares[:k] / max(count, 1)))
@@ -120,44 +129,46 @@ def apart(chain: Chain, theta: Tensor, others: Sequence[Tensor], *, seed: int) -
 
 
 def _apart(chain: Chain, theta: Tensor, others: Sequence[Tensor], seed: int) -> list[dict[str, Any]]:
-    with torch.no_grad():
-        places = chain.journal.log.progress((theta, *others), "comparing with what else was tried")
-        motions = [chain.simulate(place) for place in places]
-    square = np.zeros(len(others))
-    scores: list[list[np.ndarray]] = [[] for _ in others]
-    shares: list[list[np.ndarray]] = [[] for _ in others]
-    for view in chain.clips:
+    places = chain.journal.log.progress((theta, *others), "comparing with what else was tried")
+    motions = [chain.motion(place) for place in places]
+
+    def added(view: int) -> list[dict[str, Any]]:
         first, code, r, w = asked(chain, motions[0], view, seed)
         g = _gradient(chain, _Seen(videos=[first], J=torch.zeros(len(r), 0), r=r, weight=w))
-        for i, motion in enumerate(motions[1:]):  # one at a time: videos are large
+        found = []
+        for motion in motions[1:]:  # one at a time: videos are large
             with torch.no_grad():
                 video = chain.render(motion, view, chain.frames)
-                square[i] += w * float((chain.prior.encode(video) - code).double().square().sum())
+                square = w * float((chain.prior.encode(video) - code).double().square().sum())
             score, share = _in_blocks(g, [(video - first).double().cpu().numpy()])
-            scores[i].append(score)
-            shares[i].append(share)
+            found.append(dict(square=square, score=score, share=share))
+        return found
+
+    told = [chain.journal.ask("view", view, answer=partial(added, view)) for view in chain.clips]
     return [
-        dict(JJ=square[i, None, None].copy(), score=np.concatenate(scores[i], 1), share=np.concatenate(shares[i], 1))
-        for i in range(len(others))
+        dict(
+            JJ=np.full((1, 1), sum(one["square"] for one in views)),
+            score=np.concatenate([one["score"] for one in views], 1),
+            share=np.concatenate([one["share"] for one in views], 1),
+        )
+        for views in zip(*told)
     ]
 
 
 def _motions(chain: Chain, theta: Tensor, step: float) -> list[Any]:
     """At theta, and a step beside it in each component."""
     places = (theta, *(theta + step * torch.eye(len(theta), dtype=theta.dtype)))
+    return [chain.motion(t) for t in chain.journal.log.progress(places, "looking around")]
+
+
+def _around(chain: Chain, motions: list[Any], view: int, seed: int, step: float) -> _Seen:
+    """A view of them."""
+    first, code, r, weight = asked(chain, motions[0], view, seed)
     with torch.no_grad():
-        return [chain.simulate(t) for t in chain.journal.log.progress(places, "looking around")]
-
-
-def _around(chain: Chain, motions: list[Any], seed: int, step: float) -> Iterator[_Seen]:
-    """Every view of them."""
-    for view in chain.clips:
-        first, code, r, weight = asked(chain, motions[0], view, seed)
-        with torch.no_grad():
-            videos = [chain.render(motion, view, chain.frames) for motion in motions[1:]]
-            changes = [(chain.prior.encode(video) - code).flatten() / step for video in videos]
-        J = torch.stack(changes, 1).double().cpu()
-        yield _Seen(videos=[first, *videos], J=J, r=r, weight=weight)
+        videos = [chain.render(motion, view, chain.frames) for motion in motions[1:]]
+        changes = [(chain.prior.encode(video) - code).flatten() / step for video in videos]
+    J = torch.stack(changes, 1).double().cpu()
+    return _Seen(videos=[first, *videos], J=J, r=r, weight=weight)
 
 
 def asked(chain: Chain, motion: Any, view: int, seed: int) -> tuple[Tensor, Tensor, Tensor, float]:

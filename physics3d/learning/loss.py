@@ -8,12 +8,13 @@ compared by, the denoising loss by always the same noise (`priors/distillation.p
 prior whose estimate does not depend on the noise both are the same; of a diffusion model single values of `loss` tell
 nothing.
 
-All that takes long is asked of the chain's journal, so that a learning that was stopped goes on where it was.
+All that takes long is asked of the chain's journal, and within that every motion, so that a learning that was stopped
+goes on where it was.
 """
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -69,6 +70,15 @@ class Chain:
         clip = self.clips[view]
         return self.prior.condition(clip[0], (clip[frames],))
 
+    def motion(self, theta: Tensor) -> Any:
+        """`simulate` without derivatives."""
+        return self.noted("motion", theta, made=lambda: self.simulate(theta))
+
+    def noted(self, *question: Any, made: Callable[[], Any]) -> Any:
+        """A motion by the journal, without derivatives, on the device of the clips."""
+        with torch.no_grad():
+            return _on(next(iter(self.clips.values())).device, self.journal.ask(*question, answer=made))
+
     def loss(self, theta: Tensor, views: list[int], frames: Tensor, generator: torch.Generator) -> Tensor:
         """The first term of L, differentiable in theta."""
         motion, total, pixels = self.simulate(theta), 0.0, 0
@@ -120,10 +130,20 @@ class Chain:
         """Of these frames. `drawn`: which are drawn in their place."""
         generator, total, pixels = torch.Generator().manual_seed(seed), 0.0, 0
         with torch.no_grad():
-            motion = self.simulate(theta)
+            motion = self.motion(theta)
             for view in self.clips:
                 video = self.render(motion, view, frames if drawn is None else drawn)
                 condition = self.condition(view, frames)
                 total += denoising_loss(self.prior, video, condition, generator=generator)
                 pixels += video.numel()
         return total / pixels
+
+
+def _on(device: torch.device, motion: Any) -> Any:
+    """A tensor, or the tensors of a dataclass, on a device."""
+    if isinstance(motion, Tensor):
+        return motion.to(device)
+    if device.type == "cpu" or not is_dataclass(motion) or isinstance(motion, type):
+        return motion
+    parts = {f.name: getattr(motion, f.name) for f in fields(motion)}
+    return replace(motion, **{name: _on(device, part) for name, part in parts.items() if isinstance(part, Tensor)})

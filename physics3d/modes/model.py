@@ -16,6 +16,7 @@ from scipy import sparse
 from torch import Tensor
 
 from physics3d.boundaries.base import AbstractBoundary, Setting
+from physics3d.journal import Journal
 from physics3d.log import Log
 from physics3d.materials.base import Values
 from physics3d.matter import Matter, in_blocks, in_one_piece, of_particles, points
@@ -187,7 +188,13 @@ def model(
     values, slopes = _at_particles(splines, x.numpy(), np.where(seat >= 0, block[seat], -1), centres)
     rest = (permanent + sparse.diags(faint)).tocsr()
     shift = _shift(world, modulus, span, held)
-    exact, shapes = vibration.modes((K + _three(rest)).tocsr(), M, modes + (0 if held else 6), shift=shift)
+    journal = Journal(log)
+
+    def modes_of(whole: sparse.csr_matrix, count: int) -> tuple[np.ndarray, np.ndarray]:
+        question = ("modes of vibration", whole.diagonal(), M.diagonal(), count, shift)
+        return journal.ask(*question, answer=lambda: vibration.modes(whole, M, count, shift=shift))
+
+    exact, shapes = modes_of((K + _three(rest)).tocsr(), modes + (0 if held else 6))
     log.info(
         f"{len(single.position)} pieces, {splines.count} splines {1e3 * splines.H:.3g} mm apart, {len(weight)} points"
     )
@@ -204,7 +211,7 @@ def model(
     if found.grips:
         gripped = rest + sum(s.matrix for s in springs if s.pull is not None)
         everything = (K + _three(gripped)).tocsr()
-        _, more = vibration.modes(everything, M, modes, shift=shift)
+        _, more = modes_of(everything, modes)
         pulls = [s.pull.first[:, k] for s in springs if s.pull is not None for k in range(4)]
         fields += [more, _responses((everything + shift * M).tocsr(), [*sources, *pulls], M, rigid[:, :0])]
     scalars = basis.turned(np.concatenate(fields, 1), G, weight)
@@ -221,7 +228,12 @@ def model(
     else:
         whole = K + np.kron(C.T @ (rest @ C), np.eye(3))
         _, own_modes = vibration.dense_modes(whole, np.kron(C.T @ (scalar_mass @ C), np.eye(3)), modes, shift=shift)
-        which, factor = cubature.chosen(slopes_there, tangent, whole, own_modes, group, points_)
+        which, factor = journal.ask(
+            "points of integration",
+            whole,
+            points_,
+            answer=lambda: cubature.chosen(slopes_there, tangent, whole, own_modes, group, points_),
+        )
     slopes_there = np.ascontiguousarray(slopes_there.reshape(len(weight), 3, -1)[which].reshape(3 * len(which), -1))
     K = vibration.stiffness(slopes_there, tangent[:, which] * factor[:, None, None])
     K += np.kron(C.T @ (permanent @ C), np.eye(3))

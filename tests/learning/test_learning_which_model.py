@@ -1,7 +1,7 @@
 """Laws of models that are compared: a clip speaks for what made it, or for nobody; what should settle a tie does."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -41,42 +41,35 @@ def swing(spring: float, branch: float, time: float, *, seconds: float, frames: 
     return np.array(found)
 
 
-@dataclass(frozen=True)
-class Filmed:
-    """A motion of one place, as pictures of 40 pixels that grow darker or brighter with it, each by its own share."""
-
-    place: torch.Tensor
-
+def pictures(place: torch.Tensor) -> torch.Tensor:
+    """Of a motion of one place: 40 pixels that grow darker or brighter with it, each by its own share."""
     gain = torch.linspace(-1, 1, 40).reshape(1, 1, 40, 1)
-
-    @property
-    def clip(self) -> torch.Tensor:
-        return (0.5 + 0.5 * self.place.float()[:, None, None, None] * self.gain).expand(-1, 1, -1, 3)
+    return (0.5 + 0.5 * place.float()[:, None, None, None] * gain).expand(-1, 1, -1, 3)
 
 
 def chain_of(field: GlobalField, values: tuple[float, float, float], *, also_pulled: bool = False, **timing) -> Chain:
     """The chain of a thing with these values, filmed with noise; `also_pulled`: the steady pull after it."""
-    made = lambda pull, at: Filmed(torch.from_numpy(swing(*at, pull=pull, **timing)))
+    made = lambda pull, at: torch.from_numpy(swing(*at, pull=pull, **timing))
     longer = timing | dict(seconds=3 * timing["seconds"])
 
-    def filmed(at: tuple[float, float, float]) -> Filmed:
+    def filmed(at: tuple[float, float, float]) -> torch.Tensor:
         one = made(False, at)
-        return Filmed(torch.cat([one.place, torch.from_numpy(swing(*at, pull=True, **longer))])) if also_pulled else one
+        return torch.cat([one, torch.from_numpy(swing(*at, pull=True, **longer))]) if also_pulled else one
 
     def numbers(theta: torch.Tensor) -> tuple[float, float, float]:
         found = field.parameters(theta)
         spring, branch, time = (float(found[name]) for name in NAMES)
         return spring, 2 * (1 + NU) * branch, time
 
-    noise = NOISE * torch.randn(filmed(values).clip.shape, generator=torch.Generator().manual_seed(0))
+    noise = NOISE * torch.randn(pictures(filmed(values)).shape, generator=torch.Generator().manual_seed(0))
     return Chain(
         simulate=lambda theta: filmed(numbers(theta)),
-        render=lambda motion, view, frames: motion.clip[frames],
-        clips={0: filmed(values).clip + noise},
+        render=lambda motion, view, frames: pictures(motion)[frames],
+        clips={0: pictures(filmed(values)) + noise},
         prior=Exemplar(blur=(0.0,)),
         recordings={
             "again": lambda: lambda theta: made(False, numbers(theta)),
-            "pull": lambda: lambda theta: Filmed(torch.from_numpy(swing(*numbers(theta), pull=True, **longer))),
+            "pull": lambda: lambda theta: torch.from_numpy(swing(*numbers(theta), pull=True, **longer)),
         },
     )
 

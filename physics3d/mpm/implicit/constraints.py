@@ -26,19 +26,22 @@ class Groups:
         leader = wp.to_torch(arrays.leader)[: system.count].long()
         depth = wp.to_torch(arrays.depth)[: system.count]
         alone = torch.arange(system.count, device=leader.device)
-        self.top: Tensor = torch.where(leader >= 0, leader, alone)
+        top = torch.where(leader >= 0, leader, alone)
         follows = leader >= 0
-        ratio = torch.where(follows, depth / torch.where(follows, depth[self.top], 1.0), 1.0)
+        ratio = torch.where(follows, depth / torch.where(follows, depth[top], 1.0), 1.0)
         # nodes that are held have no part, nor have light ones that nobody follows
         ratio = torch.where((leader == HELD) | (~follows & (system.present[:, 0] == 0)), 0.0, ratio)
-        inertia = torch.zeros_like(mass).index_add_(0, self.top, ratio.square() * mass)
+        inertia = torch.zeros_like(mass).index_add_(0, top, ratio.square() * mass)
         self.ratio: Tensor = ratio[:, None]
-        self.mobility: Tensor = (system.decay / torch.where(inertia > 0, inertia, torch.inf))[
-            self.top, None
-        ] * self.ratio
+        self.mobility: Tensor = (system.decay / torch.where(inertia > 0, inertia, torch.inf))[top, None] * self.ratio
+        self.followers: Tensor = follows.nonzero()[:, 0]  # few; who is followed follows nobody
+        self.followed: Tensor = leader[self.followers]
 
     def __call__(self, x: Tensor) -> Tensor:
-        return self.mobility * torch.zeros_like(x).index_add_(0, self.top, self.ratio * x)[self.top]
+        y = self.ratio * x
+        y.index_add_(0, self.followed, y[self.followers])
+        y[self.followers] = y[self.followed]
+        return y.mul_(self.mobility)
 
 
 class Constraints:
@@ -52,12 +55,12 @@ class Constraints:
         self.groups: Groups | None = None  # P where nothing but these acts
         momentum = system.momentum
         if system.coupled and not system.launches.arrays.mirrored:
-            x = torch.rand(momentum.shape, dtype=momentum.dtype, device=momentum.device) - 0.5
+            x = _anything(momentum, 1)[0]
             groups, there = Groups(system), self._pull(x)
             if float((groups(x) - there).abs().max()) <= 100 * system.rounding * float(there.abs().max()):
                 self.groups = groups
         if system.coupled and self.groups is None:
-            x = torch.rand((2, *momentum.shape), dtype=momentum.dtype, device=momentum.device) - 0.5
+            x = _anything(momentum, 2)
             images = [self.derivative(y) for y in x]
             off = abs(dot(system.mass * x[0], images[1]) - dot(system.mass * x[1], images[0]))
             off += abs(dot(system.mass * x[0], self.derivative(images[1]) - images[1]))
@@ -81,7 +84,7 @@ class Constraints:
             return self._pull(system.mass * x) if self.projectors else self._difference(x)
         if self.P is None:
             return system.present * x
-        return ((self.P.mT if transposed else self.P) * x[:, None, :]).sum(2)
+        return torch.bmm(self.P.mT if transposed else self.P, x[:, :, None])[:, :, 0]
 
     def _pull(self, x: Tensor) -> Tensor:
         """Adjoint of momentum -> bounded velocity, at what the grid holds."""
@@ -106,3 +109,9 @@ class Constraints:
             ends.append(system.update(gravity=system.falls))
         system.grid.copy_(there)
         return (ends[0] - ends[1]) / (2 * h) if h > 0 else torch.zeros_like(x)
+
+
+def _anything(like: Tensor, count: int) -> Tensor:
+    """Vectors to try P with, the same at every call: whatever was computed before must not matter."""
+    generator = torch.Generator(like.device).manual_seed(0)
+    return torch.rand((count, *like.shape), dtype=like.dtype, device=like.device, generator=generator) - 0.5
