@@ -436,7 +436,7 @@ class Learn:
             theta.detach().numpy(),
             said,
             before=self.before(field),
-            beyond=beyond.covariance(stiff, fast, seen.push, of_branches(field.names, values, omega)),
+            beyond=beyond.covariance(stiff, fast, seen.push, of_branches(field.names, values, omega), seen.grid),
         )
         return intervals(field, widened(after, course, equal, log))
 

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from physics3d.learning.fields import AbstractField
-from physics3d.learning.loss import Chain
+from physics3d.learning.loss import COARSER, Chain
 from physics3d.learning.sandwich import Evidence, blocks, correlation_length
 from physics3d.priors.base import draws
 
@@ -66,18 +66,23 @@ class Shown:
 
     evidence: Evidence
     push: Float[np.ndarray, " k"]  # phi: change of the theta that fits with ln of the known forces; 0 without any
+    grid: Float[np.ndarray, " k"]  # what the cells of a grid are taken for, as change of theta; 0 without a grid
     rms: Float[np.ndarray, " k"]  # change of the code per unit of theta, colour in 0..1
 
 
 def shown(chain: Chain, field: AbstractField, theta: Tensor, *, seed: int, step: float = STEP) -> Shown:
-    """2 k + 1 simulations, and two more where a known force drives the motion.
+    """2 k + 1 simulations, two more where a known force drives the motion, and one where a grid moves the body.
+
+    That one is of cells COARSER times as large. Errors of cells are taken to be in proportion to their size (as those
+    of contact are, which begins a cell before the wall; a bend's are of higher order, and this too much): the change
+    of theta that draws what larger cells draw, divided by COARSER - 1, is what the cells that are used are wrong by.
 
     Scores are counted where the pictures are: s(x) = g(x) dvideo(x)/dtheta with g the gradient of the SDS loss by the
     colours of pixel x, whatever the prior's code.
     """
     made = lambda: _shown(chain, theta, seed, step)
     told = chain.journal.ask("shown", theta, seed, step, answer=made)
-    return Shown(evidence=Evidence(**told["evidence"]), push=told["push"], rms=told["rms"])
+    return Shown(evidence=Evidence(**told["evidence"]), push=told["push"], grid=told["grid"], rms=told["rms"])
 
 
 def _shown(chain: Chain, theta: Tensor, seed: int, step: float) -> dict[str, Any]:
@@ -86,6 +91,9 @@ def _shown(chain: Chain, theta: Tensor, seed: int, step: float) -> dict[str, Any
     if chain.pushed is not None:
         with torch.no_grad():
             beside.append((chain.pushed(theta, step / 2), chain.pushed(theta, -step / 2)))
+    if chain.coarser is not None:
+        with torch.no_grad():
+            beside.append((chain.coarser(theta), here))
     JJ, squares, count = np.zeros((len(beside),) * 2), np.zeros(len(beside)), 0
     scores, shares = [], []
     for seen in _around(chain, here, beside, seed, step):
@@ -95,9 +103,11 @@ def _shown(chain: Chain, theta: Tensor, seed: int, step: float) -> dict[str, Any
         score, share = _in_blocks(_gradient(chain, seen), changes)
         scores.append(score)
         shares.append(share)
-    push = np.linalg.pinv(JJ[:k, :k], hermitian=True) @ JJ[:k, k] if len(JJ) > k else np.zeros(k)
+    taken_for = np.linalg.pinv(JJ[:k, :k], hermitian=True) @ JJ[:k, k:]
+    push = taken_for[:, 0] if chain.pushed is not None else np.zeros(k)
+    grid = taken_for[:, -1] * step / (COARSER - 1) if chain.coarser is not None else np.zeros(k)
     evidence = dict(JJ=JJ[:k, :k].copy(), score=np.concatenate(scores, 1), share=np.concatenate(shares, 1))
-    return dict(evidence=evidence, push=push, rms=np.sqrt(squares[:k] / max(count, 1)))
+    return dict(evidence=evidence, push=push, grid=grid, rms=np.sqrt(squares[:k] / max(count, 1)))
 
 
 def _in_blocks(

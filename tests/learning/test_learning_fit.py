@@ -16,7 +16,7 @@ from physics3d.gaussians.twin import rasterize_plainly
 from physics3d.learning.fields import GlobalField
 from physics3d.learning.fit import fit, some_frames
 from physics3d.learning.linear import linearise, shown
-from physics3d.learning.loss import Chain
+from physics3d.learning.loss import COARSER, Chain
 from physics3d.learning.polish import LEAST, polish
 from physics3d.learning.search import search
 from physics3d.log import Log
@@ -320,6 +320,18 @@ def test_a_known_force_is_told_from_a_known_motion(poked):
     moved, more = (motion.position[-1] - motion.position[0] for motion in (plain, harder))
     # small amplitudes: the motion is proportional to the force, to a hundredth
     assert float((more - moved * math.exp(0.1)).norm()) < 0.02 * float(moved.norm())
+
+
+def test_what_cells_do_is_told_from_what_a_parameter_does():
+    """A rate that cells draw too high in proportion to their size: it is too high by all of that, whatever it is; what
+    no picture shows is left alone."""
+    chain, field = toy()
+    share = 0.08  # of ln of the rate, by the cells that are used
+    larger = lambda theta: chain.simulate(theta) * math.exp(share * (COARSER - 1))
+    found = shown(replace(chain, coarser=larger), field, field.zero(), seed=0).grid
+    # of second order in share/4 = 0.02, times the phase of up to three radians
+    assert found.tolist() == pytest.approx([share, 0.0], rel=0.05)
+    assert shown(chain, field, field.zero(), seed=0).grid.tolist() == [0.0, 0.0], "no grid here"
 
 
 def test_drawn_frames_span_the_whole_clip():
