@@ -12,6 +12,11 @@ their linear algebra; what Warp compiles is for this machine), the answer should
 The bird of PAC-NeRF falls: its stiffness starts over two decades, its Poisson's ratio over most of what can be, and the
 velocity with which it comes, read off the silhouettes, is 10 % wrong or learned beside the material.
 
+The first table of the carnation and its usual run are of this version, timed on a busy machine. All else is of the one
+before differences were taken around theta and intervals held what cells do: its usual run had 1.596e5 Pa, 2.78e4 Pa and
+0.1528 s, which those of the next two tables should be compared with, and its starts lay 7.6 % apart in E and 27 % in
+tau. The bird's search tried five stiffnesses then, and tries nine now.
+
 A run that is done stands in the .csv and is not done again; remove the file to begin anew.
 """
 

@@ -78,7 +78,7 @@ class Learn:
     learn_velocity: bool = False  # one initial velocity for the whole body
     # of gradient descent; None: none where the polish begins from a search and does without, else USUAL_STEPS
     steps: Whole | None = None
-    polish: Whole = 0  # Levenberg steps after the descent; one costs a forward run per parameter and two
+    polish: Whole = 0  # Levenberg steps after the descent; one costs two forward runs per parameter and two
     learning_rate: Annotated[float, Gt(0), Le(10)] = 0.1  # first step of theta: 0.1 is ten per cent of a parameter
     duration: Duration | None = None  # only the first part of the take is used [s]; None: all of it
     # of the take, spread over the duration; None: as many as the prior was trained on, USUAL_FRAMES if it takes any
@@ -439,7 +439,7 @@ class Learn:
             theta.detach().numpy(),
             said,
             before=self.before(field),
-            beyond=beyond.covariance(stiff, fast, seen.push, of_branches(field.names, values, omega)),
+            beyond=beyond.covariance(stiff, fast, seen.push, of_branches(field.names, values, omega), seen.grid),
         )
         return intervals(field, widened(after, course, equal, log))
 

@@ -16,7 +16,7 @@ from physics3d.gaussians.model import Gaussians
 from physics3d.journal import Journal
 from physics3d.learning.fields import AbstractField
 from physics3d.learning.film_next import recordings
-from physics3d.learning.loss import Chain
+from physics3d.learning.loss import COARSER, Chain
 from physics3d.log import Log
 from physics3d.priors.base import AbstractPrior
 from physics3d.priors.estimators.base import AbstractEstimator
@@ -89,6 +89,10 @@ def chain_of(
         )
         return stronger(part(field.parameters(theta)), velocity=field.velocity(theta), log=Log(None), **timing)
 
+    def by_larger_cells(theta: Tensor):
+        larger = replace(motion, world=replace(world, dx=COARSER * world.dx), log=Log(None))
+        return larger(part(field.parameters(theta)), velocity=field.velocity(theta), log=Log(None), **timing)
+
     def render(motion, view: int, frames: Tensor) -> Tensor:
         there = [at[i] for i in frames.tolist()]
         return draw(motion.position[there], motion.deformation[there], view)
@@ -114,6 +118,7 @@ def chain_of(
         prior=prior,
         estimator=estimator,
         pushed=pushed if forced else None,
+        coarser=by_larger_cells if motion.modes is None else None,
         recordings={name: staged(excitation, times) for name, (excitation, times) in others.items()},
         passes_a_wall=lambda theta: motion.passes_a_wall(
             part(field.parameters(theta)), velocity=field.velocity(theta), **timing

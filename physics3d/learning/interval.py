@@ -20,6 +20,9 @@ in newtons (0 where what drives the motion is a known motion, an acceleration, o
                      together, which need not be the same in slow and fast modes. A branch is known by the difference.
                      Its time changes by so much that the swing is damped as it was (`mirror.time_by_modulus`); 0 else
 
+What cells do to numbers that are not stiff is measured (`linear.shown`): e of cells as large as they are, against none,
+besides the table's width of the stiffness, for a single coarser grid says little of a stem that is a cell thick.
+
 phi is exact where all that is stiff is learned. theta is ln of a number, of Poisson's ratio ln K/mu, or a velocity in
 its own unit (`fields.py`), so a 90 % interval of the number follows from that of theta.
 """
@@ -82,9 +85,10 @@ class Beyond:
         speed: Float[np.ndarray, " k"],
         push: Float[np.ndarray, " k"],
         branch: Float[np.ndarray, " k"] | float = 0.0,
+        cells: Float[np.ndarray, " k"] | float = 0.0,
     ) -> Float[np.ndarray, "k k"]:
         """W. `stiff`: 1_m; `speed`: theta of what is a velocity, its start included, else 0; `push`: phi; `branch`: of
-        branches, `of_branches`."""
+        branches, `of_branches`; `cells`: what a grid's are taken for, `Shown.grid`."""
         changes = (
             (self.surface, stiff),
             (self.surface / 2, stiff + push),
@@ -93,6 +97,7 @@ class Beyond:
             (self.length, 2 * stiff + speed + 4 * push),
             (self.force, push),
             (math.hypot(self.surface, self.grid) / 2, branch * np.ones(len(stiff))),
+            (1.0, cells * np.ones(len(stiff))),
         )
         return sum((width**2 * np.outer(e, e) for width, e in changes), np.zeros((len(stiff),) * 2))
 

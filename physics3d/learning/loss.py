@@ -30,6 +30,8 @@ from physics3d.priors.estimators.base import AbstractEstimator
 from physics3d.priors.estimators.sds import ScoreDistillation
 from physics3d.trajectory import NotMoved
 
+COARSER = 1.25  # cells of a grid that shows what cells do
+
 
 @dataclass(frozen=True, kw_only=True)
 class Chain:
@@ -44,6 +46,8 @@ class Chain:
     estimator: AbstractEstimator = field(default_factory=ScoreDistillation)
     # theta [k], ln of a factor on every known force -> trajectory; None: no force is known that drives the motion
     pushed: Callable[[Tensor, float], Any] | None = None
+    # theta [k] -> trajectory by cells COARSER times as large; None: no grid moves the body
+    coarser: Callable[[Tensor], Any] | None = None
     # what could be filmed next, in words -> what makes its motions by theta, of as many frames; takes time when called
     recordings: Mapping[str, Callable[[], Callable[[Tensor], Any]]] = field(default_factory=dict)
     passes_a_wall: Callable[[Tensor], bool] = lambda theta: False  # that `simulate` does not feel

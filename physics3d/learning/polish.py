@@ -11,7 +11,9 @@ from physics3d.learning.loss import Chain
 from physics3d.log import Log
 
 SHORT = 1e-3  # of theta: a thousandth of a parameter
-LITTLE = 2e-3  # of the loss: what a step gains at the bottom, where intervals are a hundred times as wide
+# of the loss, that a step gains at the bottom. A standard deviation is worth 1/n of it where the clip is as good as n
+# independent numbers, and a tenth of one a hundredth of that; n is some hundreds
+LEAST = 3e-5
 
 
 def polish(
@@ -19,22 +21,26 @@ def polish(
 ) -> tuple[Float[Tensor, " k"], list[Point]]:
     """Levenberg's steps on L: what Adam leaves undone in narrow valleys where one parameter stands in for another.
 
-        (J^T J + stay L_0 + m max diag J^T J) d = -(J^T (z0 - x0_hat) + stay L_0 theta)
+        (J^T J + stay L_0 + m max diag J^T J) d = -g,   g = J^T (z0 - x0_hat) + stay L_0 theta
 
     with L_0 the loss where the step begins: the pull to the start is measured by what is left unexplained, and fades
     as that does. Measured by how bad a start was it would hold what the pictures hardly show. m grows by 8, 64, 512 on
     failures in a row and falls by 4 on success. It is the same for all components, so that one which the pictures
-    hardly show moves least. A step too short to matter, or that gains too little, ends it. Returns theta and where it
-    was after every step.
+    hardly show moves least. It ends at a step too short to matter, or where what the next one would gain without m,
+    g^T (J^T J + stay L_0)^-1 g/2, is LEAST: there theta is nearer to the bottom than a tenth of what the clip leaves
+    open, along the flattest valley too. Returns theta and where it was after every step.
     """
     now, m, grows = chain.measure(theta, seed), 1e-3, 8
     around, course = None, []
+    one = torch.eye(len(theta)).double()
     for step in log.progress(range(steps), "polishing"):
         around = around or linearise(chain, field, theta, seed=seed)
         pull = stay * max(now, 1e-12)
-        damping = m * around.JJ.diagonal().max() + pull + 1e-9 * max(now, 1e-12)
-        A = around.JJ + damping * torch.eye(len(theta)).double()
-        d = torch.linalg.solve(A, -(around.Jr + pull * theta))
+        A = around.JJ + (pull + 1e-9 * max(now, 1e-12)) * one
+        slope = around.Jr + pull * theta
+        if 0.5 * float(slope @ torch.linalg.solve(A, slope)) < LEAST * now:
+            break
+        d = torch.linalg.solve(A + m * around.JJ.diagonal().max() * one, -slope)
         trial = field.bound(theta + d.clamp(-1, 1))  # at most a factor e at once
         if float((trial - theta).abs().max()) < SHORT:
             break
@@ -46,7 +52,5 @@ def polish(
         else:
             m, grows = m * grows, 8 * grows
         course.append(Point(way="polish", theta=theta, loss=now))
-        if 0 < gained < LITTLE * now:
-            break
     log.info(f"polished: loss {now:.5g}")
     return theta, course

@@ -139,7 +139,7 @@ def compared(
 
 def within(chain: Chain, model: Simpler) -> Chain:
     """The chain of a simpler model."""
-    return replace(chain, simulate=lambda theta: chain.simulate(model.whole(theta)), pushed=None)
+    return replace(chain, simulate=lambda theta: chain.simulate(model.whole(theta)), pushed=None, coarser=None)
 
 
 def other_end(field: GlobalField, end: Point, one: Ratio) -> Verdict:

@@ -108,7 +108,7 @@ def test_exact_pictures_leave_what_they_do_not_show():
     stage = learner(START, ("youngs_modulus",))
     field = stage.field(stage.world.estimate(), speed=1.0)
     exact = Evidence(JJ=1e9 * np.eye(1), score=np.zeros((8, 9, 1)), share=np.ones((8, 9, 1)))
-    seen = Shown(evidence=exact, push=np.zeros(1), rms=np.ones(1))
+    seen = Shown(evidence=exact, push=np.zeros(1), grid=np.zeros(1), rms=np.ones(1))
     for grid in (0.278, 0.15, 0.0):
         said = stage.said(field, seen, Log(None))
         told = stage.intervals(field, field.zero(), seen, said, [], [], Beyond(grid=grid), 0.0, Log(None))[
