@@ -319,11 +319,12 @@ def interrupt_all() -> None:
     """What threads and processes compute for this one ends as well: pools wait for them, and a stage takes minutes.
     It goes on from its checkpoint when it is asked for again."""
     for thread in threading.enumerate():
-        frame = sys._current_frames().get(thread.ident or 0)
+        number = thread.ident or 0
+        frame = sys._current_frames().get(number)
         waits = frame is None or frame.f_code.co_name == "_worker"  # for work: its pool wakes it
         if thread.name.startswith("ThreadPoolExecutor") and not waits:
             stop = ctypes.py_object(KeyboardInterrupt)
-            ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread.ident), stop)
+            ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(number), stop)
     for process in multiprocessing.active_children():
         process.kill()
 
