@@ -90,7 +90,7 @@ class Learn:
     # stiffness factors tried before descending: a grid of that many, so that no period is skipped
     search: Literal[0] | Annotated[int, Ge(2), Le(10_000)] = 0
     search_span: Span = 10.0  # ... between 1/span and span, equally spaced in the logarithm
-    stay: NotNegative = 0.01  # pull to the start: cost of a factor e, in halves of the loss there, or of the polish
+    stay: NotNegative = 0.002  # pull to the start: cost of a factor e, in halves of the loss there, or of the polish
     span: Span = 100.0  # a parameter stays within start/span .. start*span
     # of what is thought likely beforehand around the start: standard deviations in the logarithm; 2.3 is a factor 10
     guess_widths: dict[str, Width] = dataclasses.field(default_factory=dict)  # of single parameters
