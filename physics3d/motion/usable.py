@@ -88,8 +88,8 @@ def check_clip(clip: Clip, *, box: tuple[float, float, float, float] | None = No
     if one_way(found.signal[:, 0]) or (main is not None and decay.frequency[main] * seconds < 0.5):
         most = float(np.percentile(size(u), 99.9)) / factor
         raise ValueError(
-            f"{name}: {len(small) / clip.fps:.2f} s are shorter than half a period of the motion; film longer, and push "
-            f"harder if nothing but noise moves there (by up to {most:.1f} px)"
+            f"{name}: {len(small) / clip.fps:.2f} s are shorter than half a period of the motion; film longer, and "
+            f"push harder if nothing but noise moves there (by up to {most:.1f} px)"
         )
     rest, distance = rest_frame(found.signal, decay, release)
     h, w = clip.frames.shape[1:3]
