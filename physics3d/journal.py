@@ -21,6 +21,7 @@ import torch
 from physics3d.artifact import decode, encode
 from physics3d.checkpoint import Checkpoint
 from physics3d.log import Log
+from physics3d.trajectory import NotMoved
 
 
 @dataclass
@@ -45,13 +46,14 @@ class Journal:
 
     def ask(self, *question: Any, answer: Callable[[], Any]) -> Any:
         """What `answer` returns, now or when it was noted: made of what a checkpoint may hold, on the CPU, never
-        changed by whoever gets it. A `question` is text, numbers, tensors and arrays."""
+        changed by whoever gets it. A `question` is text, numbers, tensors and arrays. NotMoved is an answer as well:
+        it is noted, and raised each time."""
         levels, told, key = self.book.levels, self.book.told, _digest(question)
         depth = len(told) - 1
         noted, count = levels[depth][1], told[depth]
         if count < len(noted) and noted[count][0] == key:
             told[depth] += 1
-            return noted[count][1]
+            return _told(noted[count])
         if count < len(noted):
             self.log.warn(f"it takes another path than before it was stopped, from evaluation {count + 1} on")
             del noted[count:]
@@ -59,14 +61,23 @@ class Journal:
             levels[depth + 1 :] = [[key, []]]
         told.append(0)
         try:
-            made = decode(*encode(answer()))
+            entry = [key, decode(*encode(answer()))]
+        except NotMoved as reason:  # whoever asks may go on without, and after a stop by the same path
+            entry = [key, None, str(reason)]
         finally:
             told.pop()
         del levels[depth + 1 :]
-        noted.append([key, made])
+        noted.append(entry)
         told[depth] += 1
         self.book.checkpoint.save(levels, f"after evaluation {'.'.join(map(str, told))}")
-        return made
+        return _told(entry)
+
+
+def _told(entry: list[Any]) -> Any:
+    """The answer of [digest, answer], or raise what [digest, None, reason] says."""
+    if len(entry) == 3:
+        raise NotMoved(entry[2])
+    return entry[1]
 
 
 def _digest(question: tuple[Any, ...]) -> str:

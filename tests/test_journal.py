@@ -8,6 +8,7 @@ from scipy import optimize
 import physics3d.checkpoint
 from physics3d.journal import Journal
 from physics3d.log import Log
+from physics3d.trajectory import NotMoved
 
 
 def test_an_optimiser_of_scipy_goes_on_where_it_was(tmp_path, monkeypatch):
@@ -53,6 +54,33 @@ def test_answers_to_other_questions_are_forgotten(tmp_path, monkeypatch):
     assert torch.equal(again.ask("thrice", two, answer=lambda: 3 * two), 3 * two)  # another question
     assert torch.equal(again.ask("twice", one, answer=lambda: 4 * one), 4 * one), "what came after it is computed anew"
     assert "takes another path" in (tmp_path / "log.txt").read_text()
+
+
+def test_that_there_is_no_answer_is_noted_and_costs_nothing_that_follows(tmp_path, monkeypatch):
+    """The second of three questions has none, as of a body that nothing moves: asked again after a stop, all three are
+    as they were, and nothing is computed."""
+    monkeypatch.setattr(physics3d.checkpoint, "LONGEST", 0.0)
+    computed = []
+
+    def answers() -> list[int | str]:
+        journal, found = Journal(Log(tmp_path, quiet=True)), []
+
+        def inverse(x: int) -> int:
+            computed.append(x)
+            if x == 0:
+                raise NotMoved("nothing moves it")
+            return 12 // x
+
+        for x in (3, 0, 4):
+            try:
+                found.append(journal.ask("inverse", x, answer=lambda x=x: inverse(x)))
+            except NotMoved as reason:
+                found.append(str(reason))
+        return found
+
+    assert answers() == answers() == [4, "nothing moves it", 3]
+    assert computed == [3, 0, 4]
+    assert "another path" not in (tmp_path / "log.txt").read_text()
 
 
 def test_of_a_long_answer_what_it_asked_for_is_kept_until_it_is_known(tmp_path, monkeypatch):
