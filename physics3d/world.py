@@ -40,16 +40,25 @@ class Estimate(AbstractArtifact):
 
     parameters: dict[str, Tensor]  # physical name -> scalar or one number per particle [p], SI
     velocity: Float[Tensor, "3"]  # of the body at the start [m/s]
+    density: float | None = None  # at rest [kg/m^3]; None: as given
     history: dict[str, list[float]] = field(default_factory=dict)  # curves of the learning
     intervals: dict[str, Interval] = field(default_factory=dict)  # of what was learned, by name; velocity_x, ... too
     models: dict[str, float] = field(default_factory=dict)  # simpler ones -> ln of the odds for this one against them
     film_next: dict[str, float] = field(default_factory=dict)  # recordings -> ln of the odds that they should add
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """One per parameter, of a field the mean over particles, and the density [kg/m^3] where it was learned."""
+        values = {name: float(torch.as_tensor(value).double().mean()) for name, value in self.parameters.items()}
+        return values if self.density is None else values | {"density": self.density}
 
     def check(self) -> None:
         check_old_names(self.parameters)
         for name, value in self.parameters.items():
             require_finite(f"parameter {name}", value)
         require_finite("velocity", self.velocity)
+        if self.density is not None and not (math.isfinite(self.density) and self.density > 0):
+            raise ValueError(f"density is {self.density} kg/m^3; it must be above 0, or None where it is as given")
         for name, found in self.intervals.items():
             if not (math.isfinite(found.mean) and found.deviation >= 0 and found.low <= found.high):
                 raise ValueError(f"interval of {name} is {found}; it needs a mean, and low <= high")
@@ -97,6 +106,10 @@ class World:
         and what holds them are, is then made for this one."""
         start = {name: float(torch.as_tensor(parameters[name]).double().mean()) for name in self.start}
         return replace(self, start=start)
+
+    def weighed(self, found: Estimate) -> "World":
+        """With the density that was learned, where one was."""
+        return self if found.density is None else replace(self, density=found.density)
 
     def estimate(self) -> Estimate:
         """The initial guess: the start values and velocity. Raises ValueError as `check` does."""

@@ -37,14 +37,15 @@ def of_steps(config: dict[str, Any], steps: dict[str, Step]) -> SceneMotion:
     body, trajectory = read(steps["fill"]), read(steps["simulate"])
     render = build(config["render"], "cpu", "render")
     inside = render.inside(capture, gaussians, body, trajectory, Log(None)) if render.interior else None
+    estimate = read(steps["learn"] if "learn" in steps else steps["guess"])
     return SceneMotion(
         scene=peek(steps["capture"].folder)["name"],
         capture=capture,
         gaussians=gaussians,
         body=body,
-        estimate=read(steps["learn"] if "learn" in steps else steps["guess"]),
+        estimate=estimate,
         trajectory=trajectory,
-        world=build(config["world"], "cpu", "world"),
+        world=build(config["world"], "cpu", "world").weighed(estimate),
         device=config["device"],
         interior=inside,
     )

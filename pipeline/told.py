@@ -92,17 +92,25 @@ def told(step: Step) -> Told:
 
 
 def parameters(plan: Plan) -> list[Parameter]:
-    """Of the material: where it started, what was learned and how far that can be trusted, what is true."""
+    """Of the material, and the density where it is learned: where it started, what was learned and how far that can be
+    trusted, what is true."""
     steps = {step.name: step for step in plan.steps}
     truth = peek(steps["capture"].folder)["truth"]
-    learned = means(steps["learn"]) if "learn" in steps else {}
-    intervals = peek(steps["learn"].folder).get("intervals", {}) if "learn" in steps else {}
+    start, learned, intervals = means(steps["guess"]), {}, {}
+    if "learn" in steps:
+        learned, found = means(steps["learn"]), peek(steps["learn"].folder)
+        intervals = found.get("intervals", {})
+        if (density := found.get("density")) is not None:
+            start, learned = (
+                start | {"density": steps["guess"].config["world"]["density"]},
+                learned | {"density": density},
+            )
     sides = lambda name: (
         {key: intervals[name][key] for key in ("low", "high", "determined")} if name in intervals else {}
     )
     return [
         Parameter(name=name, start=value, learned=learned.get(name), truth=truth_of(name, truth), **sides(name))
-        for name, value in means(steps["guess"]).items()
+        for name, value in start.items()
     ]
 
 

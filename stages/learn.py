@@ -28,14 +28,14 @@ from physics3d.checks import (
 from physics3d.filling.body import Body
 from physics3d.filling.in_world import look_ahead, say_resolution
 from physics3d.gaussians.model import Gaussians
-from physics3d.learning.chain import chain_of
+from physics3d.learning.chain import chain_of, is_forced
 from physics3d.learning.course import Point, history
 from physics3d.learning.curves import curves
-from physics3d.learning.fields import AXES, AbstractField, GlobalField, physical
+from physics3d.learning.fields import AXES, DENSITY, AbstractField, GlobalField, is_stiff, physical
 from physics3d.learning.film_next import film_next
 from physics3d.learning.fit import fit
 from physics3d.learning.imagined import Imagined
-from physics3d.learning.interval import Beyond, Told, intervals, is_stiff, of_branches, posterior, told, words
+from physics3d.learning.interval import Beyond, Told, intervals, of_branches, posterior, told, words
 from physics3d.learning.likelihood import Ratio, ratios
 from physics3d.learning.linear import Shown, shown
 from physics3d.learning.loss import Chain
@@ -52,7 +52,7 @@ from physics3d.pictures import contact_sheet, titled, to_uint8
 from physics3d.priors.base import AbstractPrior
 from physics3d.priors.estimators.base import AbstractEstimator
 from physics3d.priors.estimators.sds import ScoreDistillation
-from physics3d.scenes.base import Capture, Footage, Outline
+from physics3d.scenes.base import Capture, Footage, Outline, Take
 from physics3d.truth import truth_of
 from physics3d.world import Estimate, Interval, World
 
@@ -150,7 +150,9 @@ class Learn:
         if memory := self.prior.memory(len(indices)):
             log.info(f"the prior takes {memory.require()}")
         seconds = int(indices[-1]) / take.fps
-        whole = self.field(start, speed=self.natural_speed(body, seconds))
+        whole = self.field(
+            start, speed=self.natural_speed(body, seconds), density=self.world.density if self.weighs(take) else None
+        )
 
         world = self.world
 
@@ -241,6 +243,7 @@ class Learn:
             film_next=recordings,
             parameters={name: v.detach().to(torch.float32) for name, v in field.parameters(theta).items()},
             velocity=field.velocity(theta).detach().to(torch.float32),
+            density=physical(field, theta).get(DENSITY),
             history=known,
             intervals=self.intervals(field, theta, seen, said, course, equal, beyond, omega, log)
             if seen and said
@@ -279,7 +282,7 @@ class Learn:
 
     def polished(self, chain: Chain, field: AbstractField, theta: Tensor, log: Log) -> tuple[Tensor, list[Point]]:
         """Where Levenberg's steps end, and their course."""
-        return polish(chain, field, theta, steps=self.polish, stay=self.stay, seed=self.seed, log=log)
+        return polish(chain, field, theta, steps=self.polish, stay=self.pull(field), seed=self.seed, log=log)
 
     def crossed(
         self, chain: Chain, field: GlobalField, theta: Tensor, points: list[Point], log: Log
@@ -333,7 +336,7 @@ class Learn:
         equal = rivals(course, told_apart)
         if not (self.polish and chain.comparable and isinstance(field, GlobalField)):
             return equal, {}, {}
-        how: dict[str, Any] = dict(omega=omega, steps=self.polish, stay=self.stay, seed=self.seed, log=log)
+        how: dict[str, Any] = dict(omega=omega, steps=self.polish, stay=self.pull(field), seed=self.seed, log=log)
         verdicts = compared(chain, field, theta, **how)
         verdicts += [other_end(field, end, against[id(end)]) for end in equal if end.way == "across"]
         recordings = film_next(chain, theta, verdicts, seed=self.seed, log=log)
@@ -383,8 +386,21 @@ class Learn:
             return torch.arange(count) * stride
         return torch.linspace(0, total - 1, count, dtype=torch.float64).round().long()
 
-    def field(self, start: Estimate, *, speed: float) -> GlobalField:
-        """What theta means; `speed` [m/s] is the unit of an initial velocity. Raises ValueError as GlobalField does."""
+    def weighs(self, take: Take) -> bool:
+        """Whether the density is learned besides: it is uncertain, a force that is known in newtons tells it, and a
+        polish looks for it. Priors that know no recording say nothing of a force."""
+        asked = self.polish > 0 and self.estimator.descends and self.prior.needs_clip
+        return asked and self.beyond.density > 0 and is_forced(self.world, take)
+
+    def pull(self, field: AbstractField) -> Tensor:
+        """`stay` of every component [k]. That of the density is as much stronger as less is unknown of it: as of a
+        number that is thought to be within `guess_width`, `stay` is the pull."""
+        known = lambda name: self.guess_width / self.beyond.density if name == DENSITY else 1.0
+        return torch.tensor([self.stay * known(name) ** 2 for name in field.names], dtype=torch.float64)
+
+    def field(self, start: Estimate, *, speed: float, density: float | None = None) -> GlobalField:
+        """What theta means; `speed` [m/s] is the unit of an initial velocity, `density` [kg/m^3] is given where it is
+        learned. Raises ValueError as GlobalField does."""
         return GlobalField(
             start=start.parameters,
             learn=self.learn,
@@ -392,6 +408,7 @@ class Learn:
             span=self.span,
             start_velocity=start.velocity,
             velocity_scale=speed if self.learn_velocity else None,
+            density=density,
         )
 
     def varying(self, body: Body) -> Tensor | None:
@@ -432,19 +449,22 @@ class Learn:
         unit = field.velocity_scale or 1.0
         speed = [float(v) / unit for v in field.velocity(theta)] if field.velocity_scale else []
         stiff = np.array([float(is_stiff(name)) for name in field.names])
-        nodes = [0.0] * (len(field.names) - len(field.groups) - len(speed))
+        mass = np.array([float(name == DENSITY) for name in field.names])
         values = {name: float(value.mean()) for name, value in field.parameters(theta).items()}
-        fast = np.array([0.0] * len(field.groups) + speed + nodes)
+        fast = np.zeros(len(field.names))
+        fast[[name in AXES for name in field.names]] = speed
         after = posterior(
             theta.detach().numpy(),
             said,
             before=self.before(field),
-            beyond=beyond.covariance(stiff, fast, seen.push, of_branches(field.names, values, omega), seen.grid),
+            beyond=beyond.covariance(stiff, fast, seen.push, of_branches(field.names, values, omega), seen.grid, mass),
         )
         return intervals(field, widened(after, course, equal, log))
 
     def width(self, name: str) -> float:
         """Of what is thought of a component of theta before the clip."""
+        if name == DENSITY:
+            return self.beyond.density
         return WIDTH if is_node(name) else self.guess_widths.get(name, self.guess_width)
 
     def report(self, capture: Capture, field: AbstractField, learned: Estimate, seen: Shown | None, log: Log) -> None:
@@ -452,6 +472,8 @@ class Learn:
         before = physical(field, field.zero())
         after = {name: float(value.mean()) for name, value in learned.parameters.items()}
         after |= dict(zip(AXES, learned.velocity.tolist()))
+        if learned.density is not None:
+            after[DENSITY] = learned.density
         for i, name in enumerate(n for n in field.names if not is_node(n)):  # nodes are the last ones
             visible = ""
             if seen is not None:

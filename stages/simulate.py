@@ -39,11 +39,12 @@ class Simulate:
         """Raises ValueError as `check`, `look_ahead` and `rollout` do."""
         self.check()
         excitation = excited(self.excitation, self.force)
-        section = look_ahead(body, self.world, excitation, log)
+        world = self.world.weighed(estimate)
+        section = look_ahead(body, world, excitation, log)
         with torch.no_grad():
-            part = lambda values: self.world.material.per_part(values, body.part, body.parts)
+            part = lambda values: world.material.per_part(values, body.part, body.parts)
             motion = motion_of(
-                self.world.starting_at(estimate.parameters),
+                world.starting_at(estimate.parameters),
                 body.position,
                 body.volume,
                 excitation=(*body.held, *excitation),
@@ -52,8 +53,8 @@ class Simulate:
                 device=self.device,
                 log=log,
             )
-            if motion.modes is None and self.world.solver == "auto":  # otherwise said already
-                say_resolution(section, self.world.dx, log)
+            if motion.modes is None and world.solver == "auto":  # otherwise said already
+                say_resolution(section, world.dx, log)
             parameters = part(estimate.parameters)
             motion.report(parameters)
             trajectory = motion(
@@ -63,7 +64,7 @@ class Simulate:
         for name, curve in trajectory.health.items():
             for frame, value in enumerate(curve):
                 log.metric(f"health/{name}", value, frame)
-        mass = self.world.density * float(body.volume.sum())
+        mass = world.density * float(body.volume.sum())
         log.metric("mass", mass)
         log.metric("substeps_per_frame", trajectory.substeps)
         log.info(

@@ -14,7 +14,7 @@ from physics3d.filling.body import Body
 from physics3d.gaussians.deform import Backdrop, render_deformed
 from physics3d.gaussians.model import Gaussians
 from physics3d.journal import Journal
-from physics3d.learning.fields import AbstractField
+from physics3d.learning.fields import AbstractField, is_stiff
 from physics3d.learning.film_next import recordings
 from physics3d.learning.loss import COARSER, Chain
 from physics3d.log import Log
@@ -76,22 +76,27 @@ def chain_of(
     motion = moved(take.excitation or (), log)
     motion.report(first)
 
+    def rolled(by: Motion, theta: Tensor, *, more: float = 0.0, **other: Any):
+        """The motion by theta, known forces being exp(more) times what is said."""
+        lighter = -field.heavier(theta)
+        if more + lighter:
+            by = replace(
+                by,
+                world=replace(by.world, boundaries=stronger(by.world.boundaries, more + lighter)),
+                excitation=stronger(by.excitation, more + lighter),
+                modes=None if by.modes is None else by.modes.pushed(math.exp(more + lighter)),
+            )
+        values = per_mass(field.parameters(theta), lighter)
+        return by(part(values), velocity=field.velocity(theta), log=Log(None), **timing | other)
+
     def simulate(theta: Tensor):
-        return motion(part(field.parameters(theta)), velocity=field.velocity(theta), log=Log(None), **timing)
+        return rolled(motion, theta)
 
     def pushed(theta: Tensor, more: float):
-        stronger = replace(
-            motion,
-            world=replace(world, boundaries=_stronger(world.boundaries, more)),
-            excitation=(*body.held, *_stronger(take.excitation or (), more)),
-            modes=None if motion.modes is None else motion.modes.pushed(math.exp(more)),
-            log=Log(None),
-        )
-        return stronger(part(field.parameters(theta)), velocity=field.velocity(theta), log=Log(None), **timing)
+        return rolled(replace(motion, log=Log(None)), theta, more=more)
 
     def by_larger_cells(theta: Tensor):
-        larger = replace(motion, world=replace(world, dx=COARSER * world.dx), log=Log(None))
-        return larger(part(field.parameters(theta)), velocity=field.velocity(theta), log=Log(None), **timing)
+        return rolled(replace(motion, world=replace(world, dx=COARSER * world.dx), log=Log(None)), theta)
 
     def render(motion, view: int, frames: Tensor) -> Tensor:
         there = [at[i] for i in frames.tolist()]
@@ -99,29 +104,24 @@ def chain_of(
 
     def staged(excitation: tuple[AbstractBoundary, ...], times: float):
         def made():
-            slower = timing | dict(frame_dt=times * timing["frame_dt"])
             other = motion if excitation == take.excitation else moved(excitation, log.hushed())
-            return lambda theta: other(
-                part(field.parameters(theta)), velocity=field.velocity(theta), log=Log(None), **slower
-            )
+            return lambda theta: rolled(other, theta, frame_dt=times * timing["frame_dt"])
 
         return made
 
-    known = (*world.boundaries, *(take.excitation or ()))
     seconds = int(indices[-1]) / take.fps
     others = recordings(take.excitation or (), seconds)
-    forced = _stronger(known, 1.0) != known
     return Chain(
         simulate=simulate,
         render=render,
         clips=clips,
         prior=prior,
         estimator=estimator,
-        pushed=pushed if forced else None,
+        pushed=pushed if is_forced(world, take) else None,
         coarser=by_larger_cells if motion.modes is None else None,
         recordings={name: staged(excitation, times) for name, (excitation, times) in others.items()},
         passes_a_wall=lambda theta: motion.passes_a_wall(
-            part(field.parameters(theta)), velocity=field.velocity(theta), **timing
+            part(per_mass(field.parameters(theta), -field.heavier(theta))), velocity=field.velocity(theta), **timing
         ),
         on_grid=motion.modes is None,
         journal=Journal(log),
@@ -168,7 +168,21 @@ def filmed(
     return clips, draw
 
 
-def _stronger(boundaries: tuple[AbstractBoundary, ...], more: float) -> tuple[AbstractBoundary, ...]:
+def is_forced(world: World, take: Take) -> bool:
+    """Whether a force that is known in newtons drives the motion: then it tells how heavy the thing is."""
+    known = (*world.boundaries, *(take.excitation or ()))
+    return stronger(known, 1.0) != known
+
+
+def per_mass(values: dict[str, Tensor], lighter: float) -> dict[str, Tensor]:
+    """Parameters by which a body of the density that was given moves as one exp(-lighter) times as heavy by `values`,
+    forces being made smaller alike: with rho, stress and force times the same factor motion is the same."""
+    if not lighter:
+        return values
+    return {name: math.exp(lighter) * value if is_stiff(name) else value for name, value in values.items()}
+
+
+def stronger(boundaries: tuple[AbstractBoundary, ...], more: float) -> tuple[AbstractBoundary, ...]:
     """The same with forces exp(more) times as large; motions and accelerations stay."""
     times = math.exp(more)
     return tuple(

@@ -3,6 +3,7 @@ follow.
 
     p = p_0 exp(theta)              moduli [Pa], times [s], anything positive
     K/mu = (K/mu)_0 exp(theta)      Poisson's ratio, through K/mu = 2 (1 + nu) / (3 (1 - 2 nu)): it stays in (-1, 0.5)
+    rho = rho_0 exp(theta)          density, where a force known in newtons tells it
     v = v_0 + c theta               initial velocity, c [m/s] a natural speed of the scene
 
 A step of 0.1 is a change of ten per cent, whatever the unit, and all components are comparable: no scaling of
@@ -11,6 +12,7 @@ component of theta.
 """
 
 import math
+import re
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -21,6 +23,8 @@ from torch import Tensor
 from physics3d.materials.parameters import check_old_names
 
 AXES = ("velocity_x", "velocity_y", "velocity_z")
+DENSITY = "density"
+STIFF = ("modulus", "stress", "viscosity", "consistency")  # how names of what scales with the stiffness end
 
 
 class AbstractField(Protocol):
@@ -38,6 +42,10 @@ class AbstractField(Protocol):
     def velocity_scale(self) -> float | None:
         """Unit of the initial velocity [m/s]; None: it is not learned."""
 
+    @property
+    def density(self) -> float | None:
+        """As given [kg/m^3]; None: it is not learned."""
+
     def zero(self) -> Float[Tensor, " k"]:
         """theta at the start."""
 
@@ -50,6 +58,9 @@ class AbstractField(Protocol):
     def velocity(self, theta: Float[Tensor, " k"]) -> Float[Tensor, " 3"]:
         """Initial velocity [m/s], differentiable in theta."""
 
+    def heavier(self, theta: Float[Tensor, " k"]) -> float:
+        """ln of the density over the one given; no derivative goes through it."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class GlobalField:
@@ -61,6 +72,7 @@ class GlobalField:
     span: float = 100.0  # a value stays within start/span .. start*span
     start_velocity: Tensor = field(default_factory=lambda: torch.zeros(3))  # [3] [m/s]
     velocity_scale: float | None = None  # c [m/s]; None: the velocity is not learned
+    density: float | None = None  # rho_0 [kg/m^3]; None: it is not learned
 
     def __post_init__(self):
         known = ", ".join(self.start)
@@ -98,8 +110,10 @@ class GlobalField:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """One name per component of theta; tied ones are joined by +."""
-        return tuple("+".join(group) for group in self.groups) + (AXES if self.velocity_scale is not None else ())
+        """One name per component of theta: the material's, tied ones joined by +, the density, the velocity."""
+        names = tuple("+".join(group) for group in self.groups)
+        names += () if self.density is None else (DENSITY,)
+        return names + (AXES if self.velocity_scale is not None else ())
 
     def zero(self) -> Float[Tensor, " k"]:
         """theta at the start."""
@@ -107,7 +121,7 @@ class GlobalField:
 
     def bound(self, theta: Float[Tensor, " k"]) -> Float[Tensor, " k"]:
         """The nearest theta within the span; velocities are not bounded."""
-        limit, count = math.log(self.span), len(self.groups)
+        limit, count = math.log(self.span), len(self.groups) + (self.density is not None)
         return torch.cat([theta[:count].clamp(-limit, limit), theta[count:]])
 
     def parameters(self, theta: Float[Tensor, " k"]) -> dict[str, Tensor]:
@@ -125,6 +139,15 @@ class GlobalField:
         start = self.start_velocity.to(theta)
         return start if self.velocity_scale is None else start + self.velocity_scale * theta[-3:]
 
+    def heavier(self, theta: Float[Tensor, " k"]) -> float:
+        """ln of the density over the one given; no derivative goes through it."""
+        return 0.0 if self.density is None else float(theta.detach()[len(self.groups)])
+
+
+def is_stiff(name: str) -> bool:
+    """Whether a parameter scales with the stiffness: it has the unit of a stress, or of a stress times a time."""
+    return re.sub(r"_[23]$", "", name.split("+")[0]).endswith(STIFF)
+
 
 def is_poissons_ratio(name: str) -> bool:
     """Of the body, or of a part of it (part.poissons_ratio)."""
@@ -141,6 +164,8 @@ def physical(field: AbstractField, theta: Tensor) -> dict[str, float]:
     """The learned parameters in SI units."""
     values = field.parameters(theta)
     learned = {name: float(values[name].mean()) for group in field.groups for name in group}
+    if field.density is not None:
+        learned[DENSITY] = field.density * math.exp(field.heavier(theta))
     if field.velocity_scale is not None:
         learned |= dict(zip(("velocity_x", "velocity_y", "velocity_z"), field.velocity(theta).tolist()))
     return learned

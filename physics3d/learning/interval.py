@@ -12,8 +12,9 @@ in newtons (0 where what drives the motion is a known motion, an acceleration, o
 
     surface, grid    e = 1_m; the surface is that of a mass as well, so half of the density's e besides: what is thicker
                      by x bends 4 x harder and weighs 2 x more
-    density          e = 1_m + phi: E goes with rho exactly, except for a known force. One that holds a thing bent says
-                     E whatever it weighs (phi = -1); one that makes it swing says both
+    density          e = 1_m + 1_rho + phi: E goes with rho exactly, except for a known force. One that holds a thing
+                     bent says E whatever it weighs (phi = -1); one that makes it swing says both, so that the density
+                     is learned besides: then phi = -1_m - 1_rho, nothing is left here, and the width is that of S
     length           e = 2 1_m + 4 phi: E goes with rho L^2; and velocities with L
     force            e = phi: a thing that was pushed harder than is said seems softer
     branches         e = 1/share of a branch's modulus in the stiffness of fast motion: half of surface and grid
@@ -28,7 +29,6 @@ its own unit (`fields.py`), so a 90 % interval of the number follows from that o
 """
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated
@@ -40,14 +40,13 @@ from jaxtyping import Float
 
 from physics3d.checks import require_fields
 from physics3d.filling.section import Section
-from physics3d.learning.fields import AXES, AbstractField, is_poissons_ratio, physical
+from physics3d.learning.fields import AXES, DENSITY, AbstractField, is_poissons_ratio, physical
 from physics3d.learning.mirror import time_by_modulus
 from physics3d.learning.sandwich import NORMAL, Evidence, spread
 from physics3d.log import Log
 from physics3d.world import Interval
 
 Width = Annotated[float, Ge(0), Le(10)]  # relative: a standard deviation in the logarithm
-STIFF = ("modulus", "stress", "viscosity", "consistency")  # how names of what scales with the stiffness end
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,14 +85,16 @@ class Beyond:
         push: Float[np.ndarray, " k"],
         branch: Float[np.ndarray, " k"] | float = 0.0,
         cells: Float[np.ndarray, " k"] | float = 0.0,
+        mass: Float[np.ndarray, " k"] | float = 0.0,
     ) -> Float[np.ndarray, "k k"]:
         """W. `stiff`: 1_m; `speed`: theta of what is a velocity, its start included, else 0; `push`: phi; `branch`: of
-        branches, `of_branches`; `cells`: what a grid's are taken for, `Shown.grid`."""
+        branches, `of_branches`; `cells`: what a grid's are taken for, `Shown.grid`; `mass`: 1 of the density where it
+        is learned."""
         changes = (
             (self.surface, stiff),
             (self.surface / 2, stiff + push),
             (self.grid, stiff),
-            (self.density, stiff + push),
+            (self.density, stiff + mass + push),
             (self.length, 2 * stiff + speed + 4 * push),
             (self.force, push),
             (math.hypot(self.surface, self.grid) / 2, branch * np.ones(len(stiff))),
@@ -164,7 +165,7 @@ def intervals(field: AbstractField, found: Posterior) -> dict[str, Interval]:
     """Of every learned number, by its name."""
     told: dict[str, Interval] = {}
     rows = [(name, i) for i, group in enumerate(field.groups) for name in group]
-    rows += [(name, i) for i, name in enumerate(field.names) if name in AXES]
+    rows += [(name, i) for i, name in enumerate(field.names) if name in (DENSITY, *AXES)]
     for name, i in rows:
 
         def value(x: float, name=name, i=i) -> float:
@@ -199,11 +200,6 @@ def _coordinate(name: str, value: float) -> float:
     if name in AXES:
         return value
     return math.log(2 * (1 + value) / (3 * (1 - 2 * value)) if is_poissons_ratio(name) else value)
-
-
-def is_stiff(name: str) -> bool:
-    """Whether a parameter scales with the stiffness: it has the unit of a stress, or of a stress times a time."""
-    return re.sub(r"_[23]$", "", name.split("+")[0]).endswith(STIFF)
 
 
 def of_branches(names: Sequence[str], values: Mapping[str, float], omega: float) -> Float[np.ndarray, " k"]:

@@ -17,26 +17,27 @@ LEAST = 3e-5
 
 
 def polish(
-    chain: Chain, field: AbstractField, theta: Tensor, *, steps: int, stay: float, seed: int, log: Log
+    chain: Chain, field: AbstractField, theta: Tensor, *, steps: int, stay: float | Tensor, seed: int, log: Log
 ) -> tuple[Float[Tensor, " k"], list[Point]]:
     """Levenberg's steps on L: what Adam leaves undone in narrow valleys where one parameter stands in for another.
 
         (J^T J + stay L_0 + m max diag J^T J) d = -g,   g = J^T (z0 - x0_hat) + stay L_0 theta
 
-    with L_0 the loss where the step begins: the pull to the start is measured by what is left unexplained, and fades
-    as that does. Measured by how bad a start was it would hold what the pictures hardly show. m grows by 8, 64, 512 on
-    failures in a row and falls by 4 on success. It is the same for all components, so that one which the pictures
-    hardly show moves least. It ends at a step too short to matter, or where what the next one would gain without m,
-    g^T (J^T J + stay L_0)^-1 g/2, is LEAST: there theta is nearer to the bottom than a tenth of what the clip leaves
-    open, along the flattest valley too. Returns theta and where it was after every step.
+    with L_0 the loss where the step begins, and `stay` of all components or of each [k]: the pull to the start is
+    measured by what is left unexplained, and fades as that does. Measured by how bad a start was it would hold what the
+    pictures hardly show. m grows by 8, 64, 512 on failures in a row and falls by 4 on success. It is the same for all
+    components, so that one which the pictures hardly show moves least. It ends at a step too short to matter, or where
+    what the next one would gain without m, g^T (J^T J + stay L_0)^-1 g/2, is LEAST: there theta is nearer to the bottom
+    than a tenth of what the clip leaves open, along the flattest valley too. Returns theta and where it was after every
+    step.
     """
     now, m, grows = chain.measure(theta, seed), 1e-3, 8
     around, course = None, []
     one = torch.eye(len(theta)).double()
     for step in log.progress(range(steps), "polishing"):
         around = around or linearise(chain, field, theta, seed=seed)
-        pull = stay * max(now, 1e-12)
-        A = around.JJ + (pull + 1e-9 * max(now, 1e-12)) * one
+        pull = stay * max(now, 1e-12) * one.diagonal()
+        A = around.JJ + (pull + 1e-9 * max(now, 1e-12)).diag()
         slope = around.Jr + pull * theta
         if 0.5 * float(slope @ torch.linalg.solve(A, slope)) < LEAST * now:
             break
@@ -45,7 +46,7 @@ def polish(
         if float((trial - theta).abs().max()) < SHORT:
             break
         then = chain.tried(trial, seed)
-        gained = now - then + 0.5 * pull * float(theta.square().sum() - trial.square().sum())
+        gained = now - then + 0.5 * float(pull @ (theta.square() - trial.square()))
         log.metric("polish/loss", then if gained > 0 else now, step)
         if gained > 0:
             theta, now, around, m, grows = trial, then, None, m / 4, 8

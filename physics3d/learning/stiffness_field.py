@@ -58,6 +58,10 @@ class StiffnessField:
         return self.whole.velocity_scale
 
     @property
+    def density(self) -> float | None:
+        return self.whole.density
+
+    @property
     def span(self) -> float:
         return self.whole.span
 
@@ -86,6 +90,9 @@ class StiffnessField:
 
     def velocity(self, theta: Float[Tensor, " k"]) -> Float[Tensor, " 3"]:
         return self.whole.velocity(self._split(theta)[0])
+
+    def heavier(self, theta: Float[Tensor, " k"]) -> float:
+        return self.whole.heavier(self._split(theta)[0])
 
     def _split(self, theta: Tensor) -> tuple[Tensor, Tensor]:
         count = len(self.whole.names)

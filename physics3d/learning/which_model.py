@@ -117,16 +117,18 @@ def compared(
     *,
     omega: float,
     steps: int,
-    stay: float,
+    stay: float | Float[Tensor, " k"],
     seed: int,
     log: Log,
 ) -> list[Verdict]:
     """What the clip says of the simpler models of what was learned at theta: by about ten motions each."""
-    verdicts = []
+    verdicts, pull = [], torch.as_tensor(stay).expand(len(theta))
     for model in simpler(field, theta, omega):
         log.info(f"the same clip {model.name}")
         own = within(chain, model)
-        found, course = polish(own, model.field, model.field.zero(), steps=steps, stay=stay, seed=seed, log=log)
+        found, course = polish(
+            own, model.field, model.field.zero(), steps=steps, stay=pull[model.kept], seed=seed, log=log
+        )
         loss = course[-1].loss if course else own.measure(found, seed)
         (one,) = ratios(chain, theta, [(model.whole(found), loss)], seed=seed)
         verdict = Verdict(model=model, theta=found, ratio=one)

@@ -2,8 +2,6 @@
 
 import math
 
-import torch
-
 from physics3d.truth import truth_of
 from physics3d.world import Estimate
 
@@ -12,11 +10,12 @@ def parameter_errors(estimates: dict[str, Estimate], truth: dict[str, float]) ->
     """ "learned: youngs_modulus" -> value, truth, error [%], ln(value/truth), ends of its 90 % interval
     where it has one; means over particles of a field."""
     table: dict[str, dict[str, float | None]] = {}
-    for parameter in dict.fromkeys(name for estimate in estimates.values() for name in estimate.parameters):
+    numbers = {row: estimate.numbers for row, estimate in estimates.items()}
+    for parameter in dict.fromkeys(name for known in numbers.values() for name in known):
         true = truth_of(parameter, truth)
         for row, estimate in estimates.items():
-            if true is not None and parameter in estimate.parameters:
-                value = float(torch.as_tensor(estimate.parameters[parameter]).double().mean())
+            if true is not None and parameter in numbers[row]:
+                value = numbers[row][parameter]
                 positive = value > 0 and true > 0
                 table[f"{row}: {parameter}"] = {
                     "value": value,

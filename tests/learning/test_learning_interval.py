@@ -9,8 +9,8 @@ import torch
 from scipy import ndimage
 
 from physics3d.filling.section import Section
-from physics3d.learning.fields import GlobalField
-from physics3d.learning.interval import NORMAL, Beyond, intervals, is_stiff, of_branches, posterior, told, words
+from physics3d.learning.fields import GlobalField, is_stiff
+from physics3d.learning.interval import NORMAL, Beyond, intervals, of_branches, posterior, told, words
 from physics3d.learning.linear import shown
 from physics3d.learning.loss import Chain
 from physics3d.learning.polish import polish
