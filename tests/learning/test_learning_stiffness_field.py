@@ -113,6 +113,9 @@ class Graded:
     def velocity(self, theta):
         return torch.zeros(3, dtype=torch.float64)
 
+    def heavier(self, theta):
+        return 0.0
+
     def zero(self):
         return torch.zeros(1, dtype=torch.float64)
 
@@ -138,7 +141,7 @@ def test_a_soft_foot_is_found_and_a_uniform_bar_keeps_one_stiffness(tmp_path):
     assert E.shape == (256,)
     ratio = float(E[z > 0.25].log().mean() - E[z < 0.15].log().mean())
     assert ratio > 0.5 * math.log(STIFF / SOFT)
-    assert list(estimate.intervals) == ["youngs_modulus"]
+    assert list(estimate.intervals) == ["youngs_modulus", "density"]
     assert "taken" in (tmp_path / "log.txt").read_text()
     assert (tmp_path / "previews" / "stiffness.png").stat().st_size > 1000
     plain = stage(capture(ELASTIC, frames=FRAMES, views=2), *bar(), log=Log(tmp_path / "plain", quiet=True))
