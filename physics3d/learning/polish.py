@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from physics3d.learning.course import Point
-from physics3d.learning.fields import AbstractField
+from physics3d.learning.fields import DENSITY, AbstractField, is_stiff
 from physics3d.learning.linear import linearise
 from physics3d.learning.loss import Chain
 from physics3d.log import Log
@@ -26,14 +26,15 @@ def polish(
     with L_0 the loss where the step begins, and `stay` of all components or of each [k]: the pull to the start is
     measured by what is left unexplained, and fades as that does. Measured by how bad a start was it would hold what the
     pictures hardly show. m grows by 8, 64, 512 on failures in a row and falls by 4 on success. It is the same for all
-    components, so that one which the pictures hardly show moves least. It ends at a step too short to matter, or where
-    what the next one would gain without m, g^T (J^T J + stay L_0)^-1 g/2, is LEAST: there theta is nearer to the bottom
-    than a tenth of what the clip leaves open, along the flattest valley too. Returns theta and where it was after every
-    step.
+    components, so that one which the pictures hardly show moves least; where the density is learned, for that and the
+    stiffness over it, which a swing shows apart: its width and its frequency. It ends at a step too short to matter, or
+    where what the next one would gain without m, g^T (J^T J + stay L_0)^-1 g/2, is LEAST: there theta is nearer to the
+    bottom than a tenth of what the clip leaves open, along the flattest valley too. Returns theta and where it was
+    after every step.
     """
     now, m, grows = chain.measure(theta, seed), 1e-3, 8
     around, course = None, []
-    one = torch.eye(len(theta)).double()
+    one, T = torch.eye(len(theta)).double(), _by_mass(field)
     for step in log.progress(range(steps), "polishing"):
         around = around or linearise(chain, field, theta, seed=seed)
         pull = stay * max(now, 1e-12) * one.diagonal()
@@ -41,7 +42,8 @@ def polish(
         slope = around.Jr + pull * theta
         if 0.5 * float(slope @ torch.linalg.solve(A, slope)) < LEAST * now:
             break
-        d = torch.linalg.solve(A + m * around.JJ.diagonal().max() * one, -slope)
+        damped = T.T @ A @ T + m * (T.T @ around.JJ @ T).diagonal().max() * one
+        d = T @ torch.linalg.solve(damped, -T.T @ slope)
         trial = field.bound(theta + d.clamp(-1, 1))  # at most a factor e at once
         if float((trial - theta).abs().max()) < SHORT:
             break
@@ -55,3 +57,11 @@ def polish(
         course.append(Point(way="polish", theta=theta, loss=now))
     log.info(f"polished: loss {now:.5g}")
     return theta, course
+
+
+def _by_mass(field: AbstractField) -> Float[Tensor, "k k"]:
+    """theta of numbers in which what is stiff is divided by the density; the same where that is not learned."""
+    one = torch.eye(len(field.names)).double()
+    stiff = torch.tensor([float(is_stiff(name)) for name in field.names]).double()
+    density = torch.tensor([float(name == DENSITY) for name in field.names]).double()
+    return one + stiff[:, None] * density
