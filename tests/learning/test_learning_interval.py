@@ -279,7 +279,14 @@ def test_every_view_counts(views):
 
 
 def test_units_of_a_stress_are_known_by_their_name():
-    stiff = ("youngs_modulus", "plant.youngs_modulus", "branch_shear_modulus_2", "yield_stress", "viscosity")
+    stiff = (
+        "youngs_modulus",
+        "plant.youngs_modulus",
+        "branch_shear_modulus_2",
+        "yield_stress",
+        "viscosity",
+        "quadratic_coefficient",
+    )
     assert all(is_stiff(name) for name in (*stiff, "branch_shear_modulus+branch_bulk_modulus"))
     assert not any(
         is_stiff(name) for name in ("poissons_ratio", "shear_relaxation_time", "velocity_x", "friction_angle")

@@ -6,6 +6,7 @@ import pytest
 import torch
 from mpm_bodies import every_material
 
+from physics3d.learning.fields import is_stiff
 from physics3d.materials.base import AbstractMaterial
 from physics3d.materials.material_points import advance
 from physics3d.materials.mixture import Mixture
@@ -193,6 +194,22 @@ def test_small_strains_have_the_moduli_of_the_handbook(material, rng):
         tau, expected = tau.diagonal(dim1=1, dim2=2).sum(1), 3 * material.example["bulk_modulus"] * trace[:, 0, 0]
     # the next order of strain, which bulk moduli of thirty shear moduli make 1e-4 of the shear
     torch.testing.assert_close(tau, expected, rtol=1e-4, atol=1e-5 * float(expected.abs().max()))
+
+
+def test_stress_grows_with_all_that_has_its_unit(material, rng):
+    """k times as stiff, k times the stress: by name what is a modulus, a viscosity, a stress at yield. So what is k
+    times as heavy and is pushed k times as hard moves alike. In float64 to round-off, which iterations stop above."""
+    walked = []
+    increments = 0.02 * random(rng, 6, 5, 3, 3)
+    for k in (1.0, 3.7):
+        values = {n: torch.tensor(v * (k if is_stiff(n) else 1.0)).double() for n, v in material.example.items()}
+        c = material.coefficients(placed(material, values, 5)).expand(-1, 5).contiguous()
+        H, memory, stress = torch.zeros(5, 3, 3).double(), material.initial_memory(5, torch.float64), []
+        for M in increments:
+            H, tau, memory = advance(material, 0.01, M / 0.01, H, c, memory)
+            stress.append(tau / k)
+        walked.append(torch.stack(stress))
+    torch.testing.assert_close(walked[1], walked[0], rtol=1e-7, atol=1e-9 * float(walked[0].abs().max()))
 
 
 def test_no_energy_from_nothing(material, rng):
