@@ -24,7 +24,8 @@ from physics3d.materials.parameters import check_old_names
 
 AXES = ("velocity_x", "velocity_y", "velocity_z")
 DENSITY = "density"
-STIFF = ("modulus", "stress", "viscosity", "consistency", "coefficient")  # how names of what scales with the stiffness end
+# how names of what scales with the stiffness end
+STIFF = ("modulus", "stress", "viscosity", "consistency", "coefficient")
 
 
 class AbstractField(Protocol):
