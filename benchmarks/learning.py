@@ -34,6 +34,7 @@ from learning_twins import DENSITY, Twin, drawn, photographed, twin_source
 from physics3d.log import Log
 from physics3d.metrics.image import psnr
 from physics3d.world import World
+from pipeline.hired import end_with_hirer
 from pipeline.settings import compose
 from pipeline.stage import build
 from stages.fill import Fill
@@ -131,7 +132,9 @@ def main(words: list[str]) -> None:
     left = [run for run in every if run.key not in done]
     with tempfile.TemporaryDirectory(prefix="physics3d_learning_") as notes:
         log = Log(Path(notes), name="bench-learning")
-        with ProcessPoolExecutor(int(options["workers"]), mp_context=get_context("spawn")) as pool:
+        with ProcessPoolExecutor(
+            int(options["workers"]), mp_context=get_context("spawn"), initializer=end_with_hirer
+        ) as pool:
             found = as_completed([pool.submit(tried, run) for run in left])
             for one in log.progress(found, "runs", total=len(every), done=len(every) - len(left)):
                 row = {name: "" for name in COLUMNS} | one.result()

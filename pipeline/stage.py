@@ -39,6 +39,7 @@ from pipeline.fingerprint import (
     remember,
     targets,
 )
+from pipeline.hired import end_with_hirer
 
 MANIFEST = "manifest.json"
 SMALL = 1 << 20  # files up to this size are always checked by content, larger ones by size unless asked [byte]
@@ -311,6 +312,7 @@ def as_task(step: Step, device: str, verify: bool, said: set[str] | None = None)
 
     @task(name=step.name, cache_policy=NO_CACHE, persist_result=False)
     def stage(after: list[Filed]) -> Filed:
+        end_with_hirer()
         if reason := strange(step):
             raise StageError(f"{step.name}: {reason}")
         return run(step, here(device), verify, said)

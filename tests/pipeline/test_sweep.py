@@ -88,9 +88,8 @@ def test_a_worker_killed_in_the_middle_loses_nothing(folder, prefect, runner, mo
     assert f"searchFilter=tags.sweep%20%3D%20%27{name}%27" in out, "one page shows both"
 
 
-@pytest.mark.parametrize("runner", ["thread", "process", "dask", pytest.param("ray", marks=WITH_RAY)])
-def test_an_interrupt_stops_what_is_under_way_and_keeps_what_is_finished(folder, prefect, runner):
-    """A stage that would go on for ever, wherever it is computed; SIGTERM for the command alone, as a cluster does."""
+def under_way(folder: Path, prefect: dict[str, str], runner: str) -> tuple[subprocess.Popen, set[int]]:
+    """A sweep at a stage that would go on for ever, and the other processes that compute it."""
     (folder / "stop in learn").touch()
     code = (
         "import sys; from pathlib import Path; from test_sweep import variants;"
@@ -109,14 +108,35 @@ def test_an_interrupt_stops_what_is_under_way_and_keeps_what_is_finished(folder,
     while not (folder / "processes in learn").exists():
         assert process.poll() is None, process.communicate()
         time.sleep(0.05)
+    return process, {int(pid) for pid in (folder / "processes in learn").read_text().split()} - {process.pid}
+
+
+def wait_for_the_end(of: set[int]) -> None:
+    """For ever, where it does not come."""
+    while any(Path(f"/proc/{pid}").exists() for pid in of):
+        time.sleep(0.05)
+
+
+@pytest.mark.parametrize("runner", ["thread", "process", "dask", pytest.param("ray", marks=WITH_RAY)])
+def test_an_interrupt_stops_what_is_under_way_and_keeps_what_is_finished(folder, prefect, runner):
+    """Wherever it is computed; SIGTERM for the command alone, as a cluster does."""
+    process, at_work = under_way(folder, prefect, runner)
     process.terminate()
     _, err = process.communicate(timeout=120)  # for ever, where it waits for the stage
     assert process.returncode == 130 and "interrupted" in err
-    at_work = {int(pid) for pid in (folder / "processes in learn").read_text().split()} - {process.pid}
-    while any(Path(f"/proc/{pid}").exists() for pid in at_work):
-        time.sleep(0.05)
+    wait_for_the_end(at_work)
     assert not list((folder / "artifacts" / "learn").glob("[!.]*"))
     assert len(list((folder / "artifacts" / "fill").glob("[!.]*"))) == 1
+
+
+@pytest.mark.parametrize("runner", ["process", "dask"])
+def test_workers_end_with_a_command_that_is_killed(folder, prefect, runner):
+    """Killed outright it tells nobody; they would compute on beside the run that goes on in its place."""
+    process, at_work = under_way(folder, prefect, runner)
+    assert at_work, "somebody else computes"
+    process.kill()
+    process.communicate()
+    wait_for_the_end(at_work)
 
 
 def test_what_variants_share_is_computed_once_and_one_that_fails_stops_no_other(folder, prefect, capsys):
