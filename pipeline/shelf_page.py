@@ -82,7 +82,10 @@ def _entry(key: str, below: set[str], told: Manifests, shelf: Path, names: dict[
     folder = shelf / told[key]["stage"] / key
     label = names.get(f"artifacts/{told[key]['stage']}/{key}", {})
     source = "learn" if "learn" in stage else "guess"
-    parameters = peek(shelf / source / stage[source], arrays=True)["parameters"]
+    estimate = peek(shelf / source / stage[source], arrays=True)
+    learned = {name: float(value.mean()) for name, value in estimate["parameters"].items()}
+    if (density := estimate.get("density")) is not None:
+        learned["density"] = density
     sheet = next((p for p in sorted((folder / "previews").glob("*.png")) if p.stem.endswith(SHEETS)), None)
     world = told[stage[source]]["config"].get("world", {})
     return {
@@ -94,7 +97,7 @@ def _entry(key: str, below: set[str], told: Manifests, shelf: Path, names: dict[
         "seconds": sum(told[k]["seconds"] for k in below),
         "finished": told[key]["finished"],
         "rows": judged(folder) if told[key]["stage"] in JUDGES else {},
-        "parameters": {name: float(value.mean()) for name, value in parameters.items()} if source == "learn" else {},
+        "parameters": learned if source == "learn" else {},
         "picture": picture(sheet, SHOWN) if sheet else None,
         "shows": sheet.stem.replace("_", " ") if sheet else "",
     }
