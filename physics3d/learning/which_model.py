@@ -20,7 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from physics3d.learning.course import Point
-from physics3d.learning.fields import GlobalField, physical
+from physics3d.learning.fields import DENSITY, GlobalField, physical
 from physics3d.learning.likelihood import Ratio, ratios
 from physics3d.learning.loss import Chain
 from physics3d.learning.mirror import NAMES, slow_and_fast
@@ -106,6 +106,7 @@ def _without(name: str, field: GlobalField, theta: Tensor, change: dict[int, flo
         learn=tuple(name for group in groups for name in group),
         ties=tuple(group for group in groups if len(group) > 1),
         start_velocity=field.velocity(base).detach(),
+        density=physical(field, base).get(DENSITY),
     )
     return Simpler(name=name, field=left, base=base, kept=kept)
 

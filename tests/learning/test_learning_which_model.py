@@ -10,7 +10,7 @@ from scipy import stats
 from scipy.linalg import expm
 
 from physics3d.boundaries.impulse import Impulse
-from physics3d.learning.fields import GlobalField
+from physics3d.learning.fields import GlobalField, physical
 from physics3d.learning.film_next import film_next, recordings
 from physics3d.learning.likelihood import ratio
 from physics3d.learning.loss import Chain
@@ -113,6 +113,16 @@ def test_simpler_models_begin_with_the_same_swing():
         assert answer(elastic).real == pytest.approx(whole.real, rel=2 * LITTLE * (1 + branch / spring))
         # what is left of the spring adds a thousandth of it
         assert abs(answer(flowing) - whole) <= 2 * LITTLE * abs(whole)
+
+
+def test_a_simpler_model_has_the_numbers_of_the_whole(field):
+    """By its own theta and as part of the whole, the density too where it is learned."""
+    field = replace(field, density=500.0)
+    theta = torch.tensor([0.3, -0.2, 0.1, 0.25]).double()
+    for model in simpler(field, theta, 6.0):
+        own = torch.linspace(0.1, 0.4, len(model.kept)).double()
+        whole = physical(field, model.whole(own))
+        assert physical(model.field, own) == pytest.approx({name: whole[name] for name in model.field.names})
 
 
 def test_nothing_is_left_out_of_what_is_not_learned_apart(field):
