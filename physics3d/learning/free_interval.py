@@ -89,6 +89,7 @@ def free_posterior(
     summed = lambda values: np.stack([np.bincount(block, v, count) for v in values])
     each = lambda values: np.stack([summed(values[..., i]) for i in range(len(theta))], -1)
     stiff, none = np.eye(len(theta))[0], np.zeros(len(theta))
+    branch = _of_branch(motion, material, len(theta))
     evidence = Evidence(
         JJ=np.einsum("tn,tncx,tncy->xy", weight, slope, slope, optimize=True), score=each(scores), share=each(shares)
     )
@@ -96,7 +97,7 @@ def free_posterior(
         theta - likely,
         told(evidence, before=before, log=log),
         before=before,
-        beyond=replace(beyond, grid=beyond.modes).covariance(stiff, none, none, _of_branch(motion, material, len(theta))),
+        beyond=replace(beyond, grid=beyond.modes).covariance(stiff, none, none, branch),
     )
 
 

@@ -145,7 +145,8 @@ def test_intervals_of_a_free_motion_hold_the_truth(wrong):
     hits, widths, last = 0, [], 74 / FPS
     for seed in range(4):
         clip, (_, seen) = filmed(body, truth, np.random.default_rng(seed), noise=0.1, memory=0.7)
-        cost = lambda theta, clip=clip: start(body, Material.of(np.append(theta, 0.0)), clip, reference=last, large=wrong)[1]
+        told = dict(clip=clip, reference=last, large=wrong)
+        cost = lambda theta, told=told: start(body, Material.of(np.append(theta, 0.0)), **told)[1]
         near = optimize.minimize(cost, known, method="Nelder-Mead", options=dict(maxfev=150))
         material = Material.of(np.append(near.x, 0.0))
         after = free_posterior(
