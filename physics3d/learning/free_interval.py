@@ -10,9 +10,8 @@ the flow its residuals. theta is the stiffness, ln r and ln tau, and the zones i
 no force, so density and length go into it as stiffness does.
 
 What large swings do to frequency and damping, k and g (`large_swing.py`), the same clip had to tell: they are in theta
-as well, for what they are wrong by the stiffness, r and tau make good. The modes of the body are not quite those of the
-thing either, each by something else; how much stiffer fast motion is than slow motion, by which a branch is told from a
-spring, is wrong by as much as in `interval.py`.
+as well, for what they are wrong by stiffness, r and tau make good. And a branch is told from a spring by how much
+stiffer fast motion is than slow motion, which the body that was found has wrong by as much as in `interval.py`.
 """
 
 import math
