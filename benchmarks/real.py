@@ -26,7 +26,10 @@ from stages.foretell import IMAGE, LEARNED, SEEN, START
 
 RESULTS = Path(__file__).resolve().parent.parent / "docs" / "results"
 ROWS = (SEEN, LEARNED, START, IMAGE, LAST, MEAN, FIRST)
-MEASURES = ("psnr", "ssim", "ms_ssim", "vmaf", "flow_error", "frequency", "damping")
+MEASURES = (
+    *("psnr", "ssim", "ms_ssim", "vmaf", "flow_error", "frequency", "damping"),
+    *("thing_flow_error", "thing_damping"),
+)
 
 
 def main(words: list[str]) -> None:
@@ -90,6 +93,15 @@ def write(rows: list[dict], said: list[str]) -> None:
         mine, image, real = (found[(*take, name)] for name in (SEEN, IMAGE, REFERENCE))
         values = [mine["flow_error"], image["flow_error"], mine["frequency"], real["frequency"]]
         values += [mine["damping"], real["damping"]]
+        text.append(f"| {' '.join(take)} | {' | '.join('–' if v is None else f'{v:.3g}' for v in values)} |")
+    text += ["", "## The same at the thing's own pixels", ""]
+    text += ["Flow is a guess beside what moves and where there is no texture; both are counted above.", ""]
+    text += ["| take | flow error, modes as seen | image modes | damping | recorded | off [%] |", "|---" * 6 + "|"]
+    for take in takes:
+        mine, image, real = (found[(*take, name)] for name in (SEEN, IMAGE, REFERENCE))
+        damped, recorded = mine.get("thing_damping"), real.get("thing_damping")
+        values = [mine.get("thing_flow_error"), image.get("thing_flow_error"), damped, recorded]
+        values.append(100 * (damped / recorded - 1) if damped is not None and recorded else None)
         text.append(f"| {' '.join(take)} | {' | '.join('–' if v is None else f'{v:.3g}' for v in values)} |")
     (RESULTS / "real.md").write_text("\n".join(text) + "\n")
     plot(takes, found)

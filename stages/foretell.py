@@ -28,6 +28,7 @@ from physics3d.log import Log
 from physics3d.metrics.against import Lines, Reference
 from physics3d.metrics.scores import REFERENCE, Scores
 from physics3d.metrics.take_page import take_page
+from physics3d.motion.carry import moved
 from physics3d.motion.image_modes import image_modes
 from physics3d.motion.stills import stills
 from physics3d.scenes.base import Capture, Take
@@ -137,7 +138,7 @@ class Foretell:
         clips[IMAGE] = image_modes(frames[:seen], fps).frames(range(seen, len(frames)))
         clips[AGAIN] = frames[release + np.arange(len(future)) % (seen - release)]
         clips |= stills(frames, seen=seen)
-        measured = Reference(future, fps)
+        measured = Reference(future, fps, thing=moved(ready.sight.thing, flow[-1]))
         found = {REFERENCE: _plain(measured.itself()[0], take.name, notes)}
         lines: dict[str, Lines] = {}
         for name, clip in log.progress(list(clips.items()), f"scoring {take.name}"):

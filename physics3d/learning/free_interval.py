@@ -8,6 +8,10 @@ and no amplitude can make good is
 the efficient direction of variable projection (Kaufman 1975). J P are the derivatives of the data, and what is left of
 the flow its residuals. theta is the stiffness, ln r and ln tau, and the zones if they were taken. A free motion knows
 no force, so density and length go into it as stiffness does.
+
+What large swings do to frequency and damping, k and g (`large_swing.py`), the same clip had to tell: they are in theta
+as well, for what they are wrong by stiffness, r and tau make good. And a branch is told from a spring by how much
+stiffer fast motion is than slow motion, which the body that was found has wrong by as much as in `interval.py`.
 """
 
 import math
@@ -17,9 +21,11 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from physics3d.learning.free_motion import LIKELY, WIDTH, Material, Reduced, start, swinging
+from physics3d.learning.free_motion import LIKELY, WIDTH, FreeMotion, Material, Reduced, start, swinging
+from physics3d.learning.identify import WIDTH as LARGE_WIDTH
 from physics3d.learning.interval import Beyond, Posterior, log_normal, posterior, told
 from physics3d.learning.large_swing import SMALL, LargeSwing
+from physics3d.learning.mirror import time_by_modulus
 from physics3d.learning.sandwich import Evidence, blocks, correlation_length
 from physics3d.learning.seen_modes import Observed, Sight
 from physics3d.log import Log
@@ -42,23 +48,30 @@ def free_posterior(
     beyond: Beyond,
     log: Log,
 ) -> Posterior:
-    """Of theta - what was likely. `flow` [px] and its `weight` at the pixels of the sight, in the frames of `clip`."""
+    """Of theta - what was likely. `flow` [px] and its `weight` at the pixels of the sight, in the frames of `clip`.
+    `large`: as the clip tells it, or SMALL, which is known."""
     zones = len(material.zones) if np.ptp(material.zones) > 0 else 0
-    theta = np.concatenate([[material.stiffness, material.ratio, material.time], material.zones[:zones]])
-    likely = np.concatenate([[0.0, math.log(LIKELY["ratio"]), math.log(LIKELY["time"])], np.zeros(zones)])
-    before = np.array([width, WIDTH["ratio"], WIDTH["time"]] + [WIDTH["zone"]] * zones)
+    law = [] if large is SMALL else [large.slower, large.sooner]
+    theta = np.concatenate([[material.stiffness, material.ratio, material.time], material.zones[:zones], law])
+    likely = np.concatenate([[0.0, math.log(LIKELY["ratio"]), math.log(LIKELY["time"])], np.zeros(zones + len(law))])
+    before = np.array(
+        [width, WIDTH["ratio"], WIDTH["time"]]
+        + [WIDTH["zone"]] * zones
+        + [LARGE_WIDTH["slowing"], LARGE_WIDTH["loss"]][: len(law)]
+    )
 
-    def course(values: np.ndarray) -> tuple[Float[np.ndarray, "t m"], Material]:
-        """(what the flow shows of the best motion with these numbers, the material of these)."""
-        one = Material.of(values if zones else np.concatenate([values, material.zones]))
-        motion, _ = start(body, one, clip, reference=reference, large=large)
+    def course(values: np.ndarray) -> tuple[FreeMotion, Float[np.ndarray, "t m"]]:
+        """(the best motion with these numbers, what the flow shows of it)."""
+        one = Material.of(np.concatenate([values[:3], values[3 : 3 + zones] if zones else material.zones]))
+        swings = replace(large, slower=values[-2], sooner=values[-1]) if law else large
+        motion, _ = start(body, one, clip, reference=reference, large=swings)
         q = np.stack([motion.at(i / clip.fps) for i in range(len(clip.gram))])
-        return (q if reference is None else q - motion.at(reference)), one
+        return motion, (q if reference is None else q - motion.at(reference))
 
-    here, best = course(theta)
-    sides = [[course(theta + side * STEP * e)[0] for side in (1, -1)] for e in np.eye(len(theta))]
+    motion, here = course(theta)
+    sides = [[course(theta + side * STEP * e)[1] for side in (1, -1)] for e in np.eye(len(theta))]
     change = np.stack([(up - down) / (2 * STEP) for up, down in sides], -1)
-    swing = swinging(body, best, clip, reference=reference, large=large)
+    swing = swinging(body, material, clip, reference=reference, large=large)
     basis = np.einsum("mk,akt->tmak", swing.shape, swing.functions).reshape(*here.shape, -1)
     weighed = np.einsum("tmn,tnx->tmx", clip.gram, change)
     amplitude = np.linalg.solve(
@@ -74,7 +87,8 @@ def free_posterior(
     block, count = blocks(sight.pixel[:, 0], sight.pixel[:, 1], correlation_length(picture))
     summed = lambda values: np.stack([np.bincount(block, v, count) for v in values])
     each = lambda values: np.stack([summed(values[..., i]) for i in range(len(theta))], -1)
-    stiff = np.eye(len(theta))[0]
+    stiff, none = np.eye(len(theta))[0], np.zeros(len(theta))
+    branch = _of_branch(motion, material, len(theta))
     evidence = Evidence(
         JJ=np.einsum("tn,tncx,tncy->xy", weight, slope, slope, optimize=True), score=each(scores), share=each(shares)
     )
@@ -82,8 +96,17 @@ def free_posterior(
         theta - likely,
         told(evidence, before=before, log=log),
         before=before,
-        beyond=replace(beyond, grid=beyond.modes).covariance(stiff, np.zeros(len(theta)), np.zeros(len(theta))),
+        beyond=replace(beyond, grid=beyond.modes).covariance(stiff, none, none, branch),
     )
+
+
+def _of_branch(motion: FreeMotion, material: Material, count: int) -> Float[np.ndarray, " k"]:
+    """`interval.of_branches` for r and tau: of the mode that is seen most, among `count` numbers."""
+    change = np.zeros(count)
+    change[1] = 1 + math.exp(-material.ratio)  # 1/share of the branch in fast motion
+    omega = 2 * math.pi * float(motion.frequency[np.argmax(motion.loudness)])
+    change[2] = change[1] * time_by_modulus(omega * math.exp(material.time))
+    return change
 
 
 def free_intervals(found: Estimate, material: Material, after: Posterior) -> dict[str, Interval]:

@@ -11,6 +11,7 @@ from physics3d.filling.body import Body
 from physics3d.gaussians.cameras import Camera
 from physics3d.gaussians.model import Gaussians
 from physics3d.gaussians.register import register
+from physics3d.journal import Journal
 from physics3d.learning.free_body import estimate, reduced
 from physics3d.learning.free_interval import free_intervals, free_posterior
 from physics3d.learning.free_motion import FreeMotion, Material, Reduced, fit
@@ -80,12 +81,18 @@ def found_by(capture: Capture, take: Take, gaussians: Gaussians, log: Log) -> Ca
     camera, picture = take.cameras[0], take.videos[0][take.posed]
     if not take.at_rest or capture.single_object:
         return camera
-    found = register(gaussians, camera, picture, standing(take.videos[0], picture), background=capture.background)
+
+    def refined() -> tuple[Tensor, float, float, float]:
+        still = standing(take.videos[0], picture)
+        found = register(gaussians, camera, picture, still, background=capture.background)
+        return found.camera.world_to_camera, found.moved, found.before, found.after
+
+    pose, moved, before, after = Journal(log).ask("camera", take.name, camera.world_to_camera, answer=refined)
     log.info(
         f"{take.name}: its camera is refined by what stands still: what is in the middle of the picture moves by "
-        f"{found.moved:.1f} px, and pictures differ by {found.after:.3f} of the colours, {found.before:.3f} before"
+        f"{moved:.1f} px, and pictures differ by {after:.3f} of the colours, {before:.3f} before"
     )
-    return found.camera
+    return replace(camera, world_to_camera=pose)
 
 
 def first_take(

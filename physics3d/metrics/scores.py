@@ -9,7 +9,8 @@ FROZEN, REFERENCE = "frozen first frame", "reference"  # rows that everyone is c
 UNITS = {
     "psnr": "PSNR [dB]", "ssim": "SSIM", "ms_ssim": "MS-SSIM", "vmaf": "VMAF", "motion_psnr": "motion PSNR [dB]",
     "flow_error": "flow error", "frequency": "frequency [Hz]", "damping": "damping [1/s]",
-    "phase": "phase [deg]",
+    "phase": "phase [deg]", "thing_flow_error": "flow error, the thing's pixels",
+    "thing_damping": "damping, the thing's pixels [1/s]",
     "value": "value", "truth": "truth", "error_percent": "error [%]", "log_ratio": "ln(value/truth)",
     "low": "5 % below", "high": "5 % above",
 }  # fmt: skip

@@ -11,7 +11,7 @@ what moves is before what stands. What is uncovered starts from -u(y), and shows
 """
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from physics3d.motion.flow import size
 
@@ -26,6 +26,15 @@ def carried(photograph: UInt8[np.ndarray, "h w 3"], u: Float[np.ndarray, "h w 2"
     v = inverse(u)
     y, x = np.mgrid[: u.shape[0], : u.shape[1]].astype(np.float32)
     return cv2.remap(photograph, x + v[..., 0], y + v[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+
+
+def moved(where: Bool[np.ndarray, "h w"], u: Float[np.ndarray, "h w 2"]) -> Bool[np.ndarray, "h w"]:
+    """Where the pixels `where` of the photograph are seen once every pixel x is at x + u(x) [px]."""
+    import cv2
+
+    v = inverse(u)
+    y, x = np.mgrid[: u.shape[0], : u.shape[1]].astype(np.float32)
+    return cv2.remap(where.astype(np.float32), x + v[..., 0], y + v[..., 1], cv2.INTER_LINEAR) > 0.5
 
 
 def inverse(u: Float[np.ndarray, "h w 2"]) -> Float[np.ndarray, "h w 2"]:

@@ -7,11 +7,15 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+import physics3d.checkpoint
 from physics3d.gaussians.cameras import Camera, look_at
 from physics3d.gaussians.model import Gaussians
 from physics3d.gaussians.register import register
 from physics3d.gaussians.render import render
 from physics3d.gaussians.twin import rasterize_plainly
+from physics3d.learning.unknown_cause import found_by
+from physics3d.log import Log
+from physics3d.scenes.base import Capture, Take
 
 WHITE = (1.0, 1.0, 1.0)
 
@@ -87,3 +91,27 @@ def test_what_cannot_be_refined_is_named(kind, message, scene, true):
         true = replace(true, world_to_camera=look_at(torch.tensor([0.0, -1.2, 0.4]), torch.tensor([0.0, -3.0, 0.0])))
     with pytest.raises(ValueError, match=message):
         register(scene, true, picture, still, background=WHITE)
+
+
+def test_a_learning_that_was_stopped_does_not_look_for_its_camera_again(tmp_path, monkeypatch, scene, true):
+    monkeypatch.setattr(physics3d.checkpoint, "LONGEST", 0.0)
+    picture = (render(scene, true, background=torch.ones(3)).color.clamp(0, 1) * 255 + 0.5).to(torch.uint8)
+    clip = picture.expand(3, -1, -1, -1)
+    poke = Take(
+        name="poke",
+        role="learn",
+        fps=30.0,
+        cameras=(wrong(true, 0),),
+        videos=(clip,),
+        excitation=None,
+        posed=0,
+        at_rest=True,
+    )
+    capture = Capture(name="room", images=(), cameras=(), names=(), gaussians=scene, takes=(poke,), background=WHITE)
+    found = found_by(capture, poke, scene, Log(tmp_path, quiet=True))
+    assert off(found, true, scene) < 0.5 * off(poke.cameras[0], true, scene)
+    elsewhere = replace(scene, mean=scene.mean + 100.0)  # by which no camera could be refined
+    with pytest.raises(ValueError, match="nothing"):
+        found_by(capture, poke, elsewhere, Log(None))
+    again = found_by(capture, poke, elsewhere, Log(tmp_path, quiet=True))
+    assert torch.equal(again.world_to_camera, found.world_to_camera)

@@ -11,6 +11,7 @@ from scipy.integrate import solve_ivp
 from physics3d.learning.free_interval import free_posterior
 from physics3d.learning.free_motion import LIKELY, Material, Reduced, fit, modal, roots, start
 from physics3d.learning.interval import Beyond
+from physics3d.learning.large_swing import SMALL, LargeSwing
 from physics3d.learning.sandwich import NORMAL
 from physics3d.learning.seen_modes import Observed, Sight
 from physics3d.log import Log
@@ -128,9 +129,11 @@ def test_a_start_is_told_by_another_clip_of_the_same_thing(rng):
     assert np.linalg.norm(later - q[20:]) < 0.1 * np.linalg.norm(q[20:])
 
 
-def test_intervals_of_a_free_motion_hold_the_truth():
+@pytest.mark.parametrize("wrong", [SMALL, LargeSwing(slower=0.02, sooner=0.5, exponent=1.0, damping=1.0)])
+def test_intervals_of_a_free_motion_hold_the_truth(wrong):
     """4 clips whose noise lasts for frames, the best material sought in each: 90 % intervals of the stiffness and the
-    damping's two numbers hold the truth in 9 of 12 or more (of 12 clips, tried once, all 36 did)."""
+    damping's two numbers hold the truth in 9 of 12 or more (of 12 clips, tried once, all 36 did). So they do where the
+    clip was taken for that of large swings, which are slower and rub, though it is none."""
     body = chain(zones=1)
     truth = Material(stiffness=math.log(7.0), zones=np.zeros(1), ratio=math.log(0.4), time=math.log(0.06))
     count = len(body.mass)
@@ -142,8 +145,9 @@ def test_intervals_of_a_free_motion_hold_the_truth():
     hits, widths, last = 0, [], 74 / FPS
     for seed in range(4):
         clip, (_, seen) = filmed(body, truth, np.random.default_rng(seed), noise=0.1, memory=0.7)
-        cost = lambda theta, clip=clip: start(body, Material.of(np.append(theta, 0.0)), clip, reference=last)[1]
-        near = optimize.minimize(cost, known, method="Nelder-Mead", options=dict(maxfev=40))
+        told = dict(clip=clip, reference=last, large=wrong)
+        cost = lambda theta, told=told: start(body, Material.of(np.append(theta, 0.0)), **told)[1]
+        near = optimize.minimize(cost, known, method="Nelder-Mead", options=dict(maxfev=150))
         material = Material.of(np.append(near.x, 0.0))
         after = free_posterior(
             body,
@@ -153,13 +157,14 @@ def test_intervals_of_a_free_motion_hold_the_truth():
             flow=np.stack([seen, np.zeros_like(seen)], -1),
             weight=np.ones_like(seen),
             reference=last,
+            large=wrong,
             width=2.3,
             beyond=none,
             log=Log(None),
         )
         likely = np.array([0.0, math.log(LIKELY["ratio"]), math.log(LIKELY["time"])])
-        away = known - likely - after.mean
-        deviation = np.sqrt(after.covariance.diagonal())
+        away = known - likely - after.mean[:3]
+        deviation = np.sqrt(after.covariance.diagonal()[:3])
         hits += int((np.abs(away) < NORMAL * deviation).sum())
         widths.append(deviation[0])
     assert hits >= 9

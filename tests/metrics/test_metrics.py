@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from physics3d.metrics.against import Reference
 from physics3d.metrics.image import likeness, ms_ssim, psnr, ssim
 from physics3d.metrics.motion import dominant, flow_error, motion_psnr, oscillation, signal
 from physics3d.metrics.scores import Scores
@@ -98,6 +99,23 @@ def test_a_frozen_picture_has_flow_error_one_and_loses_to_the_right_motion():
     assert errors[1] < 0.5 and errors[3] == pytest.approx(2, abs=0.2)  # estimated flow: the two swings differ slightly
     assert motion_psnr(close, reference)[0] > motion_psnr(frozen, reference)[0]
     assert psnr(opposite, reference) < psnr(frozen, reference)  # why a still needs to be shown as baseline
+
+
+def test_the_motion_of_a_thing_is_measured_at_its_own_pixels():
+    """Beside it a patch without texture trembles, in each clip otherwise: it is counted as motion, but not as its."""
+    reference, told = swinging(h=96, w=224), swinging(damping=1.3, h=96, w=224)
+    for seed, clip in enumerate((reference, told)):
+        noise = torch.randint(-3, 4, (len(clip), 96, 40, 1), generator=torch.Generator().manual_seed(seed))
+        clip[:, :, -40:] = (clip[:, :, -40:] + noise).clamp(0, 255).to(torch.uint8)
+    thing = np.zeros((96, 224), bool)
+    thing[28:68, 92:132] = True  # the middle of the blob
+    measured = Reference(reference, FPS, thing=thing)
+    cells, came = measured.motion(told)[0], measured.itself()[0]
+    alone = Reference(swinging(h=96, w=224), FPS, thing=thing).motion(swinging(damping=1.3, h=96, w=224))[0]
+    assert cells["thing_flow_error"][0] == pytest.approx(alone["thing_flow_error"][0], abs=0.01)
+    assert cells["thing_flow_error"][0] < 0.5 * cells["flow_error"][0]
+    assert came["thing_damping"][0] == pytest.approx(1.0, rel=0.05)
+    assert cells["thing_damping"][0] == pytest.approx(1.3, rel=0.05)
 
 
 def test_frequency_and_damping_of_a_swing_are_recovered_from_pixels():

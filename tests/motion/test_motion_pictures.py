@@ -6,7 +6,7 @@ import torch
 from clips import FPS, decaying, swaying, texture
 
 from physics3d.metrics.image import likeness, psnr
-from physics3d.motion.carry import carried, inverse
+from physics3d.motion.carry import carried, inverse, moved
 from physics3d.motion.clip import read_clip
 from physics3d.motion.flow import flow, trust
 from physics3d.motion.image_modes import image_modes, of_another_take
@@ -144,3 +144,10 @@ def test_image_modes_beat_the_last_frame_seen_on_a_real_take(data):
     assert gain > 8  # dB; a first attempt had 11.5 at full size
     main = modes.decay.main()
     assert modes.decay.frequency[main] == pytest.approx(1.04, abs=0.02)  # Hz, read off the whole recording by eye
+
+
+def test_pixels_that_move_are_seen_where_they_arrive():
+    y, x = np.mgrid[:H, :W].astype(np.float32)
+    square = lambda side: np.maximum(abs(x - 40), abs(y - 50)) < side
+    grown = np.stack([0.5 * (x - 40) + 9, 0.5 * (y - 50) - 4], -1)  # about its middle, and shifted
+    assert (moved(square(10.5), grown) == np.roll(square(15.75), (-4, 9), (0, 1))).all()
