@@ -61,6 +61,7 @@ Width = Annotated[float, Gt(0), Le(20)]
 USUAL_FRAMES = 15  # of a clip, for priors that take any number
 USUAL_STEPS = 15  # of gradient descent, where nothing is polished
 SOFTER = 4.0  # than what the search found: a thing that a wall stopped looks as much stiffer where walls are not felt
+MATTERS = 0.02  # of the density, by which what is known of it would change the answer
 LOOKS = 2  # along the valley: a lower place is polished once, and looked around from again
 
 
@@ -180,7 +181,7 @@ class Learn:
             f"learning {', '.join(whole.names)} from take {take.name}: {len(indices)} frames over {seconds:.2f} s, "
             f"{len(chain.clips)} camera(s), {len(body.position)} particles"
         )
-        theta = whole.zero()
+        theta, stay = whole.zero(), self.pull(whole)
         course: list[Point] = []
         if self.search:
             theta, course = self.searched(chain, whole, log)
@@ -201,18 +202,26 @@ class Learn:
         if self.polish and not polished:
             log.info("no polish: single losses of this prior and estimator cannot be compared")
         elif polished:
-            theta, points = self.polished(chain, whole, theta, log)
-            theta, points = self.crossed(chain, whole, theta, points, log)
+            theta, points = self.polished(chain, whole, theta, stay, log)
+            theta, points = self.crossed(chain, whole, theta, points, stay, log)
             course += points
         seen = shown(chain, whole, theta, seed=self.seed) if chain.certain else None
         said = self.said(whole, seen, log) if seen else None
+        if seen and said and whole.density is not None:
+            firmer = self.firmer(chain, whole, theta, seen, said)
+            if (firmer > stay).any():
+                log.info("what is known of the density holds it more than the clip does: polished once more")
+                theta, points = self.polished(chain, whole, theta, stay := firmer, log)
+                course += points
+                seen = shown(chain, whole, theta, seed=self.seed)
+                said = self.said(whole, seen, log)
         for look in range(LOOKS if polished else 0):
             assert seen is not None and said is not None  # what is comparable is certain
             said, lower = self.looked_along(chain, whole, theta, seen, said, log)
             if lower is None or look == LOOKS - 1:
                 break
             log.info("along the valley the clip is explained better: the polish goes on from there")
-            theta, points = self.polished(chain, whole, whole.bound(theta + torch.from_numpy(lower)), log)
+            theta, points = self.polished(chain, whole, whole.bound(theta + torch.from_numpy(lower)), stay, log)
             course += points
             seen = shown(chain, whole, theta, seed=self.seed)
             said = self.said(whole, seen, log)
@@ -227,7 +236,7 @@ class Learn:
             more[: len(theta)] = theta
             more, descent = self.descended(over, finer, more, self.steps or USUAL_STEPS, log)
             if polished:
-                more, points = self.polished(over, finer, more, log)
+                more, points = self.polished(over, finer, more, self.pull(finer), log)
                 descent += points
             losses = chain.measure(theta, self.seed), over.measure(more, self.seed)
             if asked_for(losses, finer, seen.evidence, log):
@@ -236,7 +245,7 @@ class Learn:
                 known = {name: [*known.get(name, []), *curve] for name, curve in history(finer, descent).items()}
         beyond = self.beyond.of(section, self.world.dx, on_grid=chain.on_grid)
         omega = self.swing(chain, theta)
-        equal, models, recordings = self.alike(chain, field, theta, seen, omega, course, log)
+        equal, models, recordings = self.alike(chain, field, theta, seen, omega, course, stay, log)
         learned = replace(
             start,
             models=models,
@@ -280,12 +289,30 @@ class Learn:
             log=log,
         )
 
-    def polished(self, chain: Chain, field: AbstractField, theta: Tensor, log: Log) -> tuple[Tensor, list[Point]]:
+    def polished(
+        self, chain: Chain, field: AbstractField, theta: Tensor, stay: Tensor, log: Log
+    ) -> tuple[Tensor, list[Point]]:
         """Where Levenberg's steps end, and their course."""
-        return polish(chain, field, theta, steps=self.polish, stay=self.pull(field), seed=self.seed, log=log)
+        return polish(chain, field, theta, steps=self.polish, stay=stay, seed=self.seed, log=log)
+
+    def firmer(self, chain: Chain, field: GlobalField, theta: Tensor, seen: Shown, said: Told) -> Tensor:
+        """`pull`, stronger for the density where residuals say so, and that matters.
+
+        With the deviation v of what the clip says of it, by residuals that are counted as often as they are
+        independent, and a width sigma of what is known, the pull is v^2/sigma^2 of the curvature that is left to the
+        loss along the density when all else makes good what it can; the answer moves by v^2/(v^2 + sigma^2)."""
+        i = field.names.index(DENSITY)
+        before, pixels = self.before(field), sum(clip.numel() for clip in chain.clips.values())
+        v = before[i] * math.hypot(*(said.axes[i] * said.deviation))
+        if v**2 / (v**2 + before[i] ** 2) * abs(float(theta[i])) < MATTERS:
+            return self.pull(field)
+        left = 1 / (np.linalg.pinv(seen.evidence.JJ / pixels, hermitian=True)[i, i])
+        stay = self.pull(field)
+        stay[i] = max(float(stay[i]), v**2 / before[i] ** 2 * left / max(chain.measure(theta, self.seed), 1e-12))
+        return stay
 
     def crossed(
-        self, chain: Chain, field: GlobalField, theta: Tensor, points: list[Point], log: Log
+        self, chain: Chain, field: GlobalField, theta: Tensor, points: list[Point], stay: Tensor, log: Log
     ) -> tuple[Tensor, list[Point]]:
         """The better one of theta, where a polish with these points ended, and the end of one that begins across from
         it, in the other valley of the relaxation time; with both courses."""
@@ -295,7 +322,7 @@ class Learn:
         there = places[0] if len(places) == 1 else min(places, key=lambda place: chain.tried(place, self.seed))
         time = lambda at: physical(field, at)["shear_relaxation_time"]
         log.info(f"a relaxation time of {time(there):.3g} s damps the swing as {time(theta):.3g} s do: tried as well")
-        other, more = self.polished(chain, field, there, log)
+        other, more = self.polished(chain, field, there, stay, log)
         ends = [
             Point(way="across", theta=at, loss=way[-1].loss if way else chain.measure(at, self.seed))
             for at, way in ((theta, points), (other, more))
@@ -319,6 +346,7 @@ class Learn:
         seen: Shown | None,
         omega: float,
         course: list[Point],
+        stay: Tensor,
         log: Log,
     ) -> tuple[list[Point], dict[str, float], dict[str, float]]:
         """(what was tried and explains the clip as well; ln of the odds for what was learned against simpler models and
@@ -336,7 +364,7 @@ class Learn:
         equal = rivals(course, told_apart)
         if not (self.polish and chain.comparable and isinstance(field, GlobalField)):
             return equal, {}, {}
-        how: dict[str, Any] = dict(omega=omega, steps=self.polish, stay=self.pull(field), seed=self.seed, log=log)
+        how: dict[str, Any] = dict(omega=omega, steps=self.polish, stay=stay, seed=self.seed, log=log)
         verdicts = compared(chain, field, theta, **how)
         verdicts += [other_end(field, end, against[id(end)]) for end in equal if end.way == "across"]
         recordings = film_next(chain, theta, verdicts, seed=self.seed, log=log)
