@@ -102,7 +102,7 @@ def parameters(plan: Plan) -> list[Parameter]:
         intervals = found.get("intervals", {})
         if (density := found.get("density")) is not None:
             start, learned = (
-                start | {"density": steps["guess"].config["world"]["density"]},
+                start | {"density": manifest(steps["guess"])["config"]["world"]["density"]},
                 learned | {"density": density},
             )
     sides = lambda name: (

@@ -43,6 +43,18 @@ def body() -> Body:
     )
 
 
+def test_a_density_that_was_learned_is_that_of_the_simulation(body):
+    """As that of a world which says so; a push in newtons moves what is lighter farther."""
+    poke = Impulse(force=(2.0, 0.0, 0.0), centre=(0.1, 0.1, 0.2), radius=0.1, duration=0.05)
+    moved = lambda world, estimate: (
+        Simulate(world=world, frames=4, fps=20.0, excitation=(poke,))(body, estimate, log=Log(None)).position
+    )
+    lighter = replace(WORLD, density=500.0)
+    learned = moved(WORLD, replace(WORLD.estimate(), density=500.0))
+    assert torch.equal(learned, moved(lighter, lighter.estimate()))
+    assert float((learned - moved(WORLD, WORLD.estimate())).abs().max()) > 1e-3
+
+
 def test_stage_gives_a_trajectory_that_survives_a_file_with_metrics_and_a_picture(body, tmp_path):
     poke = Impulse(force=(2.0, 0.0, 0.0), centre=(0.1, 0.1, 0.2), radius=0.1, duration=0.05)
     log = Log(tmp_path, name="simulate", quiet=True)
