@@ -244,6 +244,9 @@ class Learn:
                 said = self.said(finer, seen, log)
                 known = {name: [*known.get(name, []), *curve] for name, curve in history(finer, descent).items()}
         beyond = self.beyond.of(section, self.world.dx, on_grid=chain.on_grid)
+        if seen is not None:
+            motion = chain.motion(theta)
+            beyond = beyond.shaped(body, motion.deformation, motion.velocity, log)
         omega = self.swing(chain, theta)
         equal, models, recordings = self.alike(chain, field, theta, seen, omega, course, stay, log)
         learned = replace(

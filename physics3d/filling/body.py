@@ -7,6 +7,7 @@ from torch import Tensor
 
 from physics3d.artifact import AbstractArtifact, require_finite
 from physics3d.boundaries.held_particles import HeldParticles
+from physics3d.filling.doubt import Doubt
 from physics3d.gaussians.embedding import Embedding
 from physics3d.matter import Matter
 
@@ -23,6 +24,7 @@ class Body(AbstractArtifact):
     embedding: Embedding  # how the moving Gaussians ride on the particles
     attached: Bool[Tensor, " p"] | None = None  # beside something static, which holds them there; None: nothing is
     matter: Matter | None = None  # of which pieces the particles stand for; None: cubes around them
+    doubt: Doubt | None = None  # where its surface is, as far as it is solid; None: no camera told
     parts: tuple[str, ...] = ()  # names of the segmentation's parts; empty: they have none
 
     @property
@@ -54,5 +56,7 @@ class Body(AbstractArtifact):
             )
         if self.matter is not None:
             self.matter.check()
+        if self.doubt is not None:
+            self.doubt.check()
         if not self.spacing > 0:
             raise ValueError(f"Body.spacing is {self.spacing:g} m, must be > 0")

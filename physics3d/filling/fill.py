@@ -26,6 +26,7 @@ from torch import Tensor
 from physics3d.filling.attachment import attached_particles
 from physics3d.filling.body import Body
 from physics3d.filling.cells import solid_cells
+from physics3d.filling.doubt import doubt_of
 from physics3d.filling.ground import Ground, ground
 from physics3d.filling.pieces import ISOLATED, join_pieces
 from physics3d.filling.seen import LIMB, Seen, seen
@@ -87,6 +88,10 @@ def fill(
     position, volume, matter = solid_cells(inside, surface.point, spacing)
     inner = cKDTree(surface.point).query(position)[0] > spacing if len(position) else np.zeros(0, bool)
 
+    doubt = None
+    if surface.doubt is not None and len(position):
+        bounds = ~surface.thin & ~surface.hidden
+        doubt = doubt_of(matter, surface.point[bounds], surface.doubt[bounds], detail, log)
     bare = _uncovered(surface, deviation, position, view, spacing)
     flat, area = sheet(surface.point[bare], surface.normal[bare], spacing, detail)
     thickness = sheet_thickness
@@ -138,6 +143,7 @@ def fill(
         embedding=embed(moving.mean.to(torch.float32), which, placed, spacing, parts=(label[which] - 1, of)),
         attached=attached,
         matter=matter,
+        doubt=doubt,
     )
 
 

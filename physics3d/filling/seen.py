@@ -13,7 +13,8 @@ Outlines exclude: the distance is the largest but for a tenth of the cameras, so
 nothing. Depths are uncertain: the distance is their mean, cut off at the truncation t (Curless and Levoy 1996). The
 larger of the two holds. What no camera sees keeps -t. Both are measured along rays, which meet the outside more
 obliquely than the inside: before they are smoothed they are divided by their slope, for else the steeper side would
-move the surface inwards, that of a stem 24 mm thick by 0.35 mm.
+move the surface inwards, that of a stem 24 mm thick by 0.35 mm. In doubt is FRONT: by FRONT_DOUBT deviations, in the
+mean over the cameras, and the same all over a body.
 """
 
 from collections.abc import Sequence
@@ -39,6 +40,7 @@ LIMB = 2.0  # deviations by which the outlines of layers of Gaussians lie outsid
 # deviations by which their near side lies before them: 2 make balls of Gaussians at known depths as large as their
 # pictures, 3 the stem of the reconstructed carnation as thick as it is
 FRONT = 2.5
+FRONT_DOUBT = 0.5  # of these
 FAR = 1e6  # depth where nothing is seen [m]
 LEAST_SLOPE = 0.33  # of distances that several cameras tell; what is flatter is cut off
 
@@ -51,6 +53,7 @@ class Seen:
     h: float  # distance of its points [m]
     distance: np.ndarray  # [i, j, k] signed, positive outside, cut off at +- truncation [m]
     outline: np.ndarray  # [i, j, k] the same, by outlines alone
+    doubt: np.ndarray  # [i, j, k] standard deviation of `distance` near the surface [m]
     unseen: np.ndarray  # [i, j, k] 1 where no camera looks: more than the truncation behind a surface; else 0
     truncation: float  # [m]
 
@@ -64,6 +67,14 @@ class Seen:
     def deep(self, x: np.ndarray) -> np.ndarray:
         """Bool [m]: points [m, 3] behind a surface by more than the truncation, out of sight."""
         return self._at(self.unseen, x) > 0.5
+
+    def doubt_at(self, x: np.ndarray) -> np.ndarray:
+        """Standard deviation [m] of where the surface is, at points [m, 3] on it."""
+        return self._at(self.doubt, x)
+
+    def distance_at(self, x: np.ndarray) -> np.ndarray:
+        """Signed distance of points [m, 3] [m], positive outside, as cameras see it; -truncation where none does."""
+        return self._at(self.distance, x)
 
     def settled(self, x: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Points [m, 3] moved onto the surface, at most `reach` [m]; its outward normals there; which have found it."""
@@ -110,6 +121,7 @@ def seen(
     mistaken = max(len(which) // 10, int(len(which) > 1))  # cameras that may be
     outline = torch.full((1 + mistaken, len(x)), -t)  # the largest
     total, looks = torch.zeros(len(x)), torch.zeros(len(x))
+    deep, met = torch.zeros(len(x)), torch.zeros(len(x))  # deviations of the Gaussians along the rays
     for camera in log.progress([cameras[i] for i in which], "looking at surfaces"):
         camera = _as_fine_as(spacing / PER_SPACING, camera, x)
         with torch.no_grad():
@@ -117,7 +129,7 @@ def seen(
                 gaussians.mean, covariance, gaussians.opacity, shown, camera, background=(0.0, 0.0, 0.0), median=True
             )
         at = drawn.at.long().cpu()  # type: ignore[union-attr]
-        front = _front(at, mean, shape, camera)
+        front, deviation = _front(at, mean, shape, camera)
         body = (at >= 0) & moving[at]
         shown_at, hidden_at = torch.where(body, front, -FAR), torch.where(body, FAR, front)
         uv, z = camera.project(x)
@@ -131,14 +143,19 @@ def seen(
         near = within & (z < d + t)
         total += torch.where(near, (d - z).clamp(max=t), 0)
         looks += near
+        on = near & (_read(body.float(), pixel, "nearest") > 0.5)
+        deep += torch.where(on, _read(deviation, pixel, "nearest"), 0)
+        met += on
     unseen = looks <= min(1, mistaken)
     distance = torch.where(unseen, -t, total / looks.clamp_min(1))
     lattice = lambda values: values.reshape(*count).double().numpy()
     smooth = lambda values: ndimage.gaussian_filter(values, 0.7)
+    along = lattice(torch.maximum(distance, outline[-1]))
     return Seen(
         lower=lower,
         h=h,
-        distance=smooth(_across(lattice(torch.maximum(distance, outline[-1])), h, t)),
+        distance=smooth(_across(along, h, t)),
+        doubt=FRONT_DOUBT * smooth(lattice(deep)) / smooth(lattice(met)).clip(1e-3) / smooth(_slope(along, h).clip(1)),
         outline=smooth(lattice(outline[-1])),
         unseen=lattice(unseen & (outline[-1] <= 0)),
         truncation=t,
@@ -147,14 +164,18 @@ def seen(
 
 def _across(distance: Float[np.ndarray, "i j k"], h: float, truncation: float) -> Float[np.ndarray, "i j k"]:
     """Distances along rays -> to the surface, to first order: divided by their slope on a lattice of h [m]."""
-    slope = np.linalg.norm(np.gradient(distance, h), axis=0)
-    return np.clip(distance / np.maximum(slope, LEAST_SLOPE), -truncation, truncation)
+    return np.clip(distance / np.maximum(_slope(distance, h), LEAST_SLOPE), -truncation, truncation)
+
+
+def _slope(distance: Float[np.ndarray, "i j k"], h: float) -> Float[np.ndarray, "i j k"]:
+    return np.linalg.norm(np.gradient(distance, h), axis=0)
 
 
 def _front(
     at: Int[Tensor, "h w"], mean: Float[Tensor, "n 3"], shape: Float[Tensor, "n 3 3"], camera: Camera
-) -> Float[Tensor, "h w"]:
-    """Depth [m] of the near side of the Gaussian `at` every pixel, where the pixel's ray meets it; FAR for -1.
+) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+    """Depth [m] of the near side of the Gaussian `at` every pixel, where the pixel's ray meets it, FAR for -1; and its
+    deviation along the ray [m], 0 for -1.
 
     A Gaussian as it is drawn, with the low pass, is densest on the ray o + s d at s = (d P (m - o))/(d P d): of a disc
     that is the place on it, however wide it is and wherever on it its centre lies.
@@ -169,9 +190,9 @@ def _front(
     towards = torch.einsum("ni,nij->nj", d, drawn)
     densest = (towards * away).sum(1) / (towards * d).sum(1)
     deviation = torch.einsum("ni,nij,nj->n", d, torch.linalg.inv(shape[which]), d).rsqrt()
-    front = torch.full(at.shape, FAR)
-    front[chosen] = (densest - FRONT * deviation).float()
-    return front
+    front, along = torch.full(at.shape, FAR), torch.zeros(at.shape)
+    front[chosen], along[chosen] = (densest - FRONT * deviation).float(), deviation.float()
+    return front, along
 
 
 def _read(picture: Float[Tensor, "h w"], pixel: Float[Tensor, "m 2"], mode: str) -> Float[Tensor, " m"]:

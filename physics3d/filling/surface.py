@@ -3,7 +3,8 @@
     samples    every Gaussian spread over its disc, averaged over voxels of half a spacing
     normals    least axis of the local covariance; outward is the side from which more of the sky is seen (what the body
                stands on or leans against hides the sky)
-    thin       both sides see the sky alike (a petal, a leaf); such samples bound no volume
+    thin       both sides see the sky alike (a petal, a leaf), or cameras see past it on both sides, less than a spacing
+               apart; such samples bound no volume
     place      where the photographs' cameras see the surface (`seen.py`), and not below what the body stands on
                (`ground.py`), into which its sides go on; without cameras a deviation outside the Gaussians' centres
 
@@ -27,6 +28,7 @@ LEAST_SEEN = (
 )
 RIM = (0.5, 2.0)  # height above the ground of samples whose sides go on below it [spacings]
 DEEP = 2.0  # they go on at most so far [spacings]
+THIN = 1.0  # what cameras see past on both sides of, this far apart, bounds no volume either [spacings]
 LEVEL = 0.7  # cosine to the ground's normal from which a sample is no side
 
 
@@ -39,6 +41,7 @@ class Surface:
     enclosure: "Enclosure"  # where the samples are met by rays
     thin: np.ndarray  # [m] bool: both sides see the sky
     hidden: np.ndarray  # [m] bool: neither side does, or no camera sees a surface near it
+    doubt: np.ndarray | None = None  # [m] standard deviation of where it is, as cameras tell it [m]; None without them
 
 
 def sample_surface(
@@ -78,9 +81,11 @@ def sample_surface(
         outward = np.where(thin | hidden, 0.0, deviation)[:, None] * normal
         return Surface(point + outward, normal, enclosure, thin=thin, hidden=hidden), deviation
 
+    side = THIN / 2 * spacing * axis
+    thin |= ~hidden & (view.distance_at(point + side) > 0) & (view.distance_at(point - side) > 0)
     solid = ~thin & ~hidden
     point, normal, found = _settled(point, normal, deviation, solid, view, detail, log)
-    hidden = hidden | (solid & ~found)
+    hidden, doubt = hidden | (solid & ~found), view.doubt_at(point)
     if below is not None:
         end, downwards = _ends_below(view, below, detail)
         side, outwards = _sides_below(point[solid & found], normal[solid & found], view, below, detail)
@@ -88,8 +93,10 @@ def sample_surface(
         none = np.zeros(len(end) + len(side))
         thin, hidden = (np.concatenate([a, none > 0]) for a in (thin, hidden))
         deviation = np.concatenate([deviation, none])
+        doubt = np.concatenate([doubt, below.doubt(end), below.doubt(side)])
     # what is filled reaches out to the samples where they are now
-    return Surface(point, normal, Enclosure(np.concatenate([walls, point]), h), thin=thin, hidden=hidden), deviation
+    enclosure = Enclosure(np.concatenate([walls, point]), h)
+    return Surface(point, normal, enclosure, thin=thin, hidden=hidden, doubt=doubt), deviation
 
 
 def over_discs(gaussians: Gaussians, step: float) -> tuple[np.ndarray, np.ndarray]:

@@ -10,8 +10,9 @@ sum of sigma^2 e e^T, with sigma a relative width (`Beyond`) and e the change of
 (moduli, stresses at yield, viscosities) scales alike, 1_m; with phi = A^-1 J^T dz/d(ln force) for forces that are known
 in newtons (0 where what drives the motion is a known motion, an acceleration, or unknown)
 
-    surface, grid    e = 1_m; the surface is that of a mass as well, so half of the density's e besides: what is thicker
-                     by x bends 4 x harder and weighs 2 x more
+    surface, grid    e = 1_m; the surface is that of a mass as well, so the density's e besides, with half of the width:
+                     what is thicker by x bends 4 x harder and weighs 2 x more; or with both widths as the body's own
+                     surface leaves them open in the motion that was filmed (`filling/doubt.py`)
     density          e = 1_m + 1_rho + phi: E goes with rho exactly, except for a known force. One that holds a thing
                      bent says E whatever it weighs (phi = -1); one that makes it swing says both, so that the density
                      is learned besides: then phi = -1_m - 1_rho, nothing is left here, and the width is that of S
@@ -37,8 +38,11 @@ import numpy as np
 import torch
 from annotated_types import Ge, Le
 from jaxtyping import Float
+from torch import Tensor
 
 from physics3d.checks import require_fields
+from physics3d.filling.body import Body
+from physics3d.filling.doubt import widths
 from physics3d.filling.section import Section
 from physics3d.learning.fields import AXES, DENSITY, AbstractField, is_poissons_ratio, physical
 from physics3d.learning.mirror import time_by_modulus
@@ -54,7 +58,8 @@ class Beyond:
     """Relative widths of what residuals do not show.
 
     surface: of the stiffness of a reconstructed part, that is of the second moment of its section. The reconstructed
-    stem of `docs/results/filling.md`: 2 % wrong in the mean, 25 % in the worst section.
+    stem of `docs/results/filling.md`: 2 % wrong in the mean, 25 % in the worst section. Learning takes more where the
+    surface leaves more open in this motion: what is thin, or what no photograph shows.
     grid: of the stiffness, by the resolution of the grid. A cantilever two cells thick is 4.9 % wrong in frequency,
     10 % in E (`docs/results/simulation.md`); the carnation, its stem as thick, 18 % in E against tetrahedra. Learning
     takes more where the thinnest held section (`filling/section.py`) has fewer cells: 28 % for one.
@@ -63,6 +68,7 @@ class Beyond:
     """
 
     surface: Width = 0.1
+    mass: Width | None = None  # of the mass, by where the surface is; None: half of `surface`
     grid: Width = 0.15
     modes: Width = 0.05
     density: Width = 0.1  # of the density, as given
@@ -78,6 +84,21 @@ class Beyond:
             return replace(self, grid=self.modes)
         return self if section is None else replace(self, grid=max(self.grid, 2 * section.grid_error(dx)))
 
+    def shaped(
+        self, body: Body, deformation: Float[Tensor, "t p 3 3"], velocity: Float[Tensor, "t p 3"], log: Log
+    ) -> "Beyond":
+        """For a body that moves like this: F and velocity [m/s] of its particles, or either of a mode in any unit."""
+        if body.doubt is None or self.surface == 0:
+            return self
+        left = widths(body.doubt, body.position, body.volume, deformation, velocity)
+        log.metric("surface_width", left.stiffness)
+        unshown = ", most of it where no photograph shows it" if left.unshown > 0.5 else ""
+        log.info(
+            f"where the surface is leaves {100 * left.stiffness:.0f} % of the stiffness open in this motion{unshown}, "
+            f"and {100 * left.mass:.0f} % of the mass"
+        )
+        return replace(self, surface=max(self.surface, left.stiffness), mass=max(self.surface / 2, left.mass))
+
     def covariance(
         self,
         stiff: Float[np.ndarray, " k"],
@@ -92,7 +113,7 @@ class Beyond:
         is learned."""
         changes = (
             (self.surface, stiff),
-            (self.surface / 2, stiff + push),
+            (self.surface / 2 if self.mass is None else self.mass, stiff + push),
             (self.grid, stiff),
             (self.density, stiff + mass + push),
             (self.length, 2 * stiff + speed + 4 * push),

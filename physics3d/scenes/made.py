@@ -33,7 +33,7 @@ from physics3d.checks import (
 )
 from physics3d.scenes.base import AbstractSource, Capture, Outline
 from physics3d.scenes.reference_motion import Pokes, path_of
-from physics3d.scenes.room import DAYLIGHT, photographers, room, witness
+from physics3d.scenes.room import DAYLIGHT, RINGS, Rings, photographers, room, witness
 from physics3d.scenes.shapes import AbstractShape, Place, Sheet
 from physics3d.scenes.studio import Mesh, Studio
 from physics3d.scenes.synthetic import captured, outlined, particles, within
@@ -53,6 +53,7 @@ class MadeTwin(AbstractSource):
     distance: Length = 0.5  # of the cameras from there [m]
     opening: Positive = 44.0  # of the lens, across [deg]
     views: Count = 40
+    rings: Rings = RINGS  # how high above the horizon the photographs are taken from [deg], and what share of them
     width: Pixels = 320  # [px]
     height: Pixels = 240
     held_out_every: Every = 8  # every so many photographs are kept for evaluation
@@ -69,6 +70,8 @@ class MadeTwin(AbstractSource):
             shape.check()
         if not any(shape.full for shape in self.moving.values()):
             raise ValueError("source.moving has no shape that is full; nothing would move, make one of them full")
+        if abs(sum(share for _, share in self.rings) - 1) > 1e-6:
+            raise ValueError(f"source.rings is {self.rings}; the shares, the second numbers, must add up to 1")
 
     def files(self) -> tuple[str, ...]:
         kept = path_of(self.name)
@@ -88,7 +91,7 @@ class MadeTwin(AbstractSource):
             matter=self.matter(),
             solids=self.solids(),
             studio=Studio([*self.meshes(), *room()], DAYLIGHT, openness_rays=24, seed=self.seed),
-            cameras=photographers(self.views, self.width, self.height, **seen),
+            cameras=photographers(self.views, self.width, self.height, rings=self.rings, **seen),
             witness=witness(self.width, self.height, **seen),
             frames=self.frames,
             fps=self.fps,

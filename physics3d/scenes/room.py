@@ -3,13 +3,20 @@
 Everything here stands still. Metres, z up.
 """
 
-import numpy as np
+from typing import Annotated
 
+import numpy as np
+from annotated_types import Ge, Le
+
+from physics3d.checks import Share
 from physics3d.gaussians.cameras import Camera
 from physics3d.scenes.studio import Light, Mesh, ring, surface_grid, to_linear
 
+Elevation = Annotated[float, Ge(-80), Le(80)]
+
 DAYLIGHT = Light(backdrop=(0.80, 0.83, 0.86))
-RINGS = ((14.0, 0.45), (32.0, 0.35), (58.0, 0.20))  # elevation of the cameras [deg], share of the views
+Rings = tuple[tuple[Elevation, Share], ...]  # of the cameras above the horizon [deg], share of the views
+RINGS: Rings = ((14.0, 0.45), (32.0, 0.35), (58.0, 0.20))
 
 
 def room() -> list[Mesh]:
@@ -29,13 +36,20 @@ def room() -> list[Mesh]:
 
 
 def photographers(
-    views: int, width: int, height: int, *, target: tuple[float, float, float], distance: float, opening: float
+    views: int,
+    width: int,
+    height: int,
+    *,
+    target: tuple[float, float, float],
+    distance: float,
+    opening: float,
+    rings: Rings = RINGS,
 ) -> list[Camera]:
-    """Cameras on three rings at `distance` [m] around the front of `target`, never behind the wall; `opening` [deg]."""
-    counts = [round(views * share) for _, share in RINGS]
+    """Cameras on `rings` at `distance` [m] around the front of `target`, never behind the wall; `opening` [deg]."""
+    counts = [round(views * share) for _, share in rings]
     counts[0] += views - sum(counts)
     cameras = []
-    for i, ((elevation, _), count) in enumerate(zip(RINGS, counts)):
+    for i, ((elevation, _), count) in enumerate(zip(rings, counts)):
         azimuths = -90 + np.linspace(-112, 112, count) + 4 * (i - 1)
         cameras += ring(
             target,
