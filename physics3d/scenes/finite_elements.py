@@ -7,14 +7,14 @@ F = I + grad u; the discretisation is theirs.
     int rho N (a - b) dV + int grad N : P(F) dV = 0,    b = force / mass of the part that is pushed
 
 in time by the implicit midpoint rule, x = (u_n + u_n+1)/2, and Broyden's method on the exact tangent of an earlier
-state, factored again where that has become too slow. The mesh is cut where the body is held, so that its face is where
-it is written.
+state, factored again where that has become too slow. The mesh follows the faces of the boxes that hold the body, and
+has nothing inside of them, so that they are where they are written.
 """
 
 import contextlib
 import itertools
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,7 +23,7 @@ import torch
 from jaxtyping import Float, Int
 from scipy import sparse
 
-from physics3d.boundaries.base import AbstractBoundary
+from physics3d.boundaries.base import AbstractBoundary, Setting
 from physics3d.boundaries.fixed_region import FixedRegion
 from physics3d.boundaries.impulse import Impulse
 from physics3d.modes.stress import Points
@@ -38,11 +38,15 @@ MOST_ITERATIONS = 60
 SLOW = 20  # iterations after which a new tangent is factored
 
 
+Still = Callable[[Float[np.ndarray, "n 3"]], np.ndarray]  # which of these places [m] are held: bool [n]
+
+
 @dataclass(frozen=True)
 class Body:
-    """Tetrahedra of a body above the plane that it is held at: nodes of their own, `basis` is scikit-fem's."""
+    """Tetrahedra of the part of a body that is not held: nodes of their own, `basis` is scikit-fem's."""
 
     basis: Any
+    still: Still
     held: Int[np.ndarray, " h"]  # nodes
     gradient: sparse.csr_matrix  # [3 n, nodes] of the functions at the points [1/m]
     value: sparse.csr_matrix  # [n, nodes] of the functions at the points
@@ -58,35 +62,35 @@ class Body:
 def meshed(solids: Sequence[Mesh], world: World, edge: float) -> Body:
     """The part of the solids that is not held, in tetrahedra with edges of about `edge` [m].
 
-    Raises ValueError where something else than a `FixedRegion` that takes in all of the body below its upper face
-    bounds the world, and ImportError without pytetwild (`pip install pytetwild pyvista`)."""
+    Raises ValueError where something else than regions that are held bounds the world, or it has gravity, and
+    ImportError without pytetwild (`pip install pytetwild pyvista`)."""
     import pytetwild
     import pyvista
     from skfem import MeshTet
 
-    plane = _plane(solids, world)
-    points: list[np.ndarray] = []
-    faces: list[np.ndarray] = []
-    for solid in solids:
-        surface = pyvista.make_tri_mesh(solid.vertices.astype(float), solid.faces)
-        surface = surface.clean(tolerance=SAME, absolute=True)  # rounding parts what meets on an axis
-        if surface.bounds[4] < plane:
-            surface = surface.clip_closed_surface("z", origin=(0.0, 0.0, plane)).triangulate().clean()
-        if surface.n_cells:
-            faces.append(surface.regular_faces + sum(map(len, points)))
-            points.append(np.asarray(surface.points))
-    corners = np.concatenate(points)
+    boxes = _held(world)
+    surfaces = [pyvista.make_tri_mesh(solid.vertices.astype(float), solid.faces) for solid in solids]
+    surfaces = [s.clean(tolerance=SAME, absolute=True) for s in surfaces]  # rounding parts what meets on an axis
+    around = np.array([s.bounds for s in surfaces]).reshape(-1, 3, 2)
+    lower, upper = around[..., 0].min(0) - edge, around[..., 1].max(0) + edge
+    for box in boxes:  # the mesher follows all faces that it is given
+        near = np.clip(box, lower, upper)
+        if (near[0] < near[1]).all():
+            surfaces.append(pyvista.Cube(bounds=near.T.ravel()).triangulate().clean())
+    corners = np.concatenate([np.asarray(s.points, float) for s in surfaces])
+    first = np.cumsum([0] + [s.n_points for s in surfaces])
+    faces = np.concatenate([s.regular_faces + i for s, i in zip(surfaces, first)]).astype(np.int32)
     across = float(np.linalg.norm(corners.max(0) - corners.min(0)))
-    surfaces = np.concatenate(faces).astype(np.int32)
     with tempfile.TemporaryDirectory() as notes, contextlib.chdir(notes):  # fTetWild leaves a file where it runs
-        nodes, cells = pytetwild.tetrahedralize(corners, surfaces, edge_length_fac=edge / across, optimize=True)[:2]
-    cells = cells[within(list(solids), nodes[cells].mean(1))]
+        nodes, cells = pytetwild.tetrahedralize(corners, faces, edge_length_fac=edge / across, optimize=True)[:2]
+    middle = nodes[cells].mean(1)
+    cells = cells[within(list(solids), middle) & ~_inside(boxes, middle)]
     mesh = MeshTet(np.ascontiguousarray(nodes.T), np.ascontiguousarray(cells.T)).remove_unused_nodes()
-    return on(mesh, plane + 0.02 * edge)  # the mesh follows the cut to a thousandth
+    return on(mesh, lambda x: _inside(boxes, x, 0.02 * edge))  # the mesh follows their faces to a thousandth
 
 
-def on(mesh: Any, held_below: float) -> Body:
-    """A body of scikit-fem's tetrahedra, held at its nodes up to a height [m]."""
+def on(mesh: Any, still: Still) -> Body:
+    """A body of scikit-fem's tetrahedra, held at those of its nodes that are `still`."""
     from skfem import Basis, ElementTetP2
 
     basis = Basis(mesh, ElementTetP2(), intorder=2)
@@ -108,7 +112,8 @@ def on(mesh: Any, held_below: float) -> Body:
     nodes = basis.doflocs.T
     return Body(
         basis=basis,
-        held=np.flatnonzero(nodes[:, 2] <= held_below),
+        still=still,
+        held=np.flatnonzero(still(nodes)),
         gradient=slope.tocsr(),
         value=value.tocsr(),
         place=np.moveaxis(np.asarray(basis.global_coordinates()), 0, -1).reshape(-1, 3),
@@ -116,18 +121,19 @@ def on(mesh: Any, held_below: float) -> Body:
     )
 
 
-def _plane(solids: Sequence[Mesh], world: World) -> float:
-    """Height [m] of the face at which the body is held from below."""
-    vertices = np.concatenate([solid.vertices for solid in solids])
-    if len(world.boundaries) == 1 and isinstance(region := world.boundaries[0], FixedRegion):
-        lower, upper = np.array(region.lower), np.array(region.upper)
-        below = vertices[vertices[:, 2] <= upper[2]]
-        if len(below) and (below >= lower).all() and (below[:, :2] <= upper[:2]).all() and not any(world.gravity):
-            return float(upper[2])
-    raise ValueError(
-        f"source.world has boundaries {world.boundaries} and gravity {world.gravity}; finite elements are made for "
-        "bodies without weight that one FixedRegion holds from below"
-    )
+def _held(world: World) -> list[Float[np.ndarray, "2 3"]]:
+    """The boxes [m] that hold the body still."""
+    if any(world.gravity) or not all(isinstance(one, FixedRegion) for one in world.boundaries) or not world.boundaries:
+        raise ValueError(
+            f"source.world has boundaries {world.boundaries} and gravity {world.gravity}; finite elements are made for "
+            "bodies without weight that a FixedRegion holds"
+        )
+    return [np.array([one.lower, one.upper], float) for one in world.boundaries if isinstance(one, FixedRegion)]
+
+
+def _inside(boxes: Sequence[Float[np.ndarray, "2 3"]], x: Float[np.ndarray, "n 3"], more: float = 0.0) -> np.ndarray:
+    """Bool [n]: places in any of the boxes, `more` [m] larger on all sides."""
+    return np.any([((x >= lower - more) & (x <= upper + more)).all(1) for lower, upper in boxes], 0)
 
 
 def frequencies(body: Body, world: World, count: int) -> list[float]:
@@ -143,8 +149,8 @@ def swing(
 ) -> Float[np.ndarray, "t nodes 3"]:
     """Displacement [m] of the nodes at the frames, from rest; `steps` time steps to a frame.
 
-    Raises ValueError where the excitation is something else than one Impulse with a force on a ball, and where
-    Newton's method finds no step."""
+    Raises ValueError where the excitation is something else than one Impulse with a force on a ball or a box, and
+    where Newton's method finds no step."""
     points, _, M = _linear(body, world)
     push, load = _load(body, world, excitation)
     free = _free(body)
@@ -195,7 +201,7 @@ def swing(
 def carried(
     body: Body, films: Float[np.ndarray, "t nodes 3"], place: Float[np.ndarray, "p 3"]
 ) -> tuple[Float[np.ndarray, "t p 3"], Float[np.ndarray, "t p 3 3"]]:
-    """(position [m], F) of what is at `place` [m] at rest: that of its tetrahedron, at rest below the mesh."""
+    """(position [m], F) of what is at `place` [m] at rest: that of its tetrahedron, at rest where it is held."""
     from scipy.spatial import cKDTree
 
     basis = body.basis
@@ -207,7 +213,7 @@ def carried(
     best = share.min(0).argmax(0)
     cell = near[np.arange(len(place)), best]
     X = local[:, best, np.arange(len(place))]
-    stays = place[:, 2] < basis.doflocs[2].min()
+    stays = body.still(place)
     x = np.broadcast_to(place, (len(films), *place.shape)).copy()
     F = np.broadcast_to(np.eye(3), (len(films), len(place), 3, 3)).copy()
     slope = np.linalg.inv(np.moveaxis(mesh.mapping().DF(np.zeros((3, 1)), tind=cell)[..., 0], -1, 0))  # [p, a, i]
@@ -241,8 +247,15 @@ def _free(body: Body) -> Int[np.ndarray, " f"]:
 def _load(body: Body, world: World, excitation: tuple[AbstractBoundary, ...]) -> tuple[Impulse, np.ndarray]:
     """(the push, its force on the nodes [N])."""
     push = excitation[0] if len(excitation) == 1 else None
-    if not isinstance(push, Impulse) or push.radius is None or push.force is None:
-        raise ValueError(f"the excitation is {excitation}; finite elements are made for one Impulse: a force on a ball")
-    inside = np.linalg.norm(body.place - np.array(push.centre), axis=1) <= push.radius
+    if not isinstance(push, Impulse) or push.nearest is not None or push.force is None:
+        raise ValueError(
+            f"the excitation is {excitation}; finite elements are made for one Impulse: a force on a ball or a box"
+        )
+    place, weight = torch.from_numpy(body.place), torch.from_numpy(body.weight)
+    every = (float("-inf"),) * 3, (float("inf"),) * 3
+    setting = Setting(
+        position=place, mass=world.density * weight, volume=weight, lower=every[0], upper=every[1], dx=world.dx
+    )
+    inside = push.selection(setting).numpy()
     share = body.weight * inside / (body.weight * inside).sum()
     return push, np.outer(body.value.T @ share, np.asarray(push.force, float)).ravel()

@@ -32,7 +32,7 @@ TIP = (0.0, 0.0, LENGTH)
 
 def beam() -> finite_elements.Body:
     across, along = np.linspace(-THICK / 2, THICK / 2, 3), np.linspace(0, LENGTH, 25)
-    return finite_elements.on(MeshTet.init_tensor(across, across, along), 1e-9)
+    return finite_elements.on(MeshTet.init_tensor(across, across, along), lambda x: x[:, 2] <= 1e-9)
 
 
 def world(branch: float, relaxation: float) -> World:
