@@ -30,7 +30,7 @@ def rod(radius: float) -> Matter:
 
 
 def bent(matter: Matter, curvature: float = 1e-3) -> tuple[torch.Tensor, torch.Tensor]:
-    """F and velocity of pure bending about y to first order: strain of -curvature z along x, without Poisson's ratio."""
+    """F and velocity of pure bending about y to first order: strain of -curvature z along x, of no Poisson's ratio."""
     x, _, z = matter.position.T
     F = torch.eye(3, dtype=torch.float64).expand(len(x), 3, 3).clone()
     F[:, 0, 0] -= curvature * z
