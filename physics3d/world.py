@@ -33,6 +33,11 @@ class Interval:
     high: float  # and above likewise
     determined: bool  # whether the clip has at least halved the deviation
 
+    def holding(self, learned: float) -> "Interval":
+        """Wide enough for what was learned: what a clip hardly tells is pulled to what was thought before, in the mean
+        farther than the fit of least loss, which moves the body and must not be said to be improbable."""
+        return replace(self, low=min(self.low, learned), high=max(self.high, learned))
+
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate(AbstractArtifact):

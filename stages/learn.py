@@ -490,7 +490,7 @@ class Learn:
             before=self.before(field),
             beyond=beyond.covariance(stiff, fast, seen.push, of_branches(field.names, values, omega), seen.grid, mass),
         )
-        return intervals(field, widened(after, course, equal, log))
+        return intervals(field, widened(after, course, equal, log), theta.detach().numpy())
 
     def width(self, name: str) -> float:
         """Of what is thought of a component of theta before the clip."""

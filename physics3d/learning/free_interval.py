@@ -129,5 +129,5 @@ def free_intervals(found: Estimate, material: Material, after: Posterior) -> dic
             middle=learned * math.exp(e @ (after.mean[:3] - theta)),
             deviation=math.sqrt(e @ after.covariance[:3, :3] @ e),
             before=float(np.linalg.norm(e * after.before[:3])),
-        )
+        ).holding(learned)
     return told

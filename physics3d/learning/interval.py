@@ -182,8 +182,8 @@ def posterior(
     return Posterior(mean=before * mean, covariance=before[:, None] * covariance * before, before=before)
 
 
-def intervals(field: AbstractField, found: Posterior) -> dict[str, Interval]:
-    """Of every learned number, by its name."""
+def intervals(field: AbstractField, found: Posterior, theta: Float[np.ndarray, " k"]) -> dict[str, Interval]:
+    """Of every learned number, by its name; they hold what was learned, `theta`."""
     told: dict[str, Interval] = {}
     rows = [(name, i) for i, group in enumerate(field.groups) for name in group]
     rows += [(name, i) for i, name in enumerate(field.names) if name in (DENSITY, *AXES)]
@@ -203,7 +203,7 @@ def intervals(field: AbstractField, found: Posterior) -> dict[str, Interval]:
             low=value(centre - NORMAL * deviation),
             high=value(centre + NORMAL * deviation),
             determined=deviation <= 0.5 * float(found.before[i]),
-        )
+        ).holding(value(float(theta[i])))
     return told
 
 

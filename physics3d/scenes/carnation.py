@@ -69,8 +69,7 @@ class CarnationTwin(AbstractSource):
     device: Device = "cpu"
 
     def files(self) -> tuple[str, ...]:
-        kept = path_of(self.motion)
-        return (str(kept),) if kept.exists() else ()
+        return (str(path_of(self.motion)),)  # even if missing: the pipeline asks once
 
     @property
     def outline(self) -> Outline:

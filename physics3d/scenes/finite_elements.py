@@ -71,6 +71,8 @@ def meshed(solids: Sequence[Mesh], world: World, edge: float) -> Body:
     boxes = _held(world)
     surfaces = [pyvista.make_tri_mesh(solid.vertices.astype(float), solid.faces) for solid in solids]
     surfaces = [s.clean(tolerance=SAME, absolute=True) for s in surfaces]  # rounding parts what meets on an axis
+    # inside is to the mesher what faces go round outwards
+    surfaces = [s if _volume(s) > 0 else s.flip_faces() for s in surfaces]
     around = np.array([s.bounds for s in surfaces]).reshape(-1, 3, 2)
     lower, upper = around[..., 0].min(0) - edge, around[..., 1].max(0) + edge
     for box in boxes:  # the mesher follows all faces that it is given
@@ -119,6 +121,12 @@ def on(mesh: Any, still: Still) -> Body:
         place=np.moveaxis(np.asarray(basis.global_coordinates()), 0, -1).reshape(-1, 3),
         weight=basis.dx.ravel(),
     )
+
+
+def _volume(surface: Any) -> float:
+    """Signed volume [m^3] of pyvista's closed triangles: negative where they go round inwards."""
+    a, b, c = np.moveaxis(np.asarray(surface.points)[surface.regular_faces], 1, 0)
+    return float((a * np.cross(b, c)).sum()) / 6
 
 
 def _held(world: World) -> list[Float[np.ndarray, "2 3"]]:

@@ -9,8 +9,8 @@ import torch
 from scipy import ndimage
 
 from physics3d.filling.section import Section
-from physics3d.learning.fields import GlobalField, is_stiff
-from physics3d.learning.interval import NORMAL, Beyond, intervals, of_branches, posterior, told, words
+from physics3d.learning.fields import GlobalField, is_stiff, physical
+from physics3d.learning.interval import NORMAL, Beyond, Posterior, intervals, of_branches, posterior, told, words
 from physics3d.learning.linear import shown
 from physics3d.learning.loss import Chain
 from physics3d.learning.polish import polish
@@ -118,7 +118,7 @@ def test_a_viscoelastic_oscillator_is_recovered_with_its_intervals():
         seen = shown(noisy, field, theta, seed=0)
         none = np.zeros((3, 3))
         after = after_clip(theta.numpy(), seen.evidence, before=np.full(3, 2.3), beyond=none)
-        limits = intervals(field, after)
+        limits = intervals(field, after, theta.numpy())
         for i, (name, true) in enumerate({"youngs_modulus": 9.0, "relaxation_time": 2.0}.items()):
             hits[i] += limits[name].low < true < limits[name].high
             assert limits[name].determined
@@ -133,6 +133,20 @@ def test_a_viscoelastic_oscillator_is_recovered_with_its_intervals():
     assert 0.80 <= hits.sum() / 400 <= 0.97
     assert naive.sum() / 400 < 0.5
     assert abs(np.mean(errors)) < 0.2 * np.std(errors), "no bias to speak of beside the spread"
+
+
+@pytest.mark.parametrize("factor", [0.02, 0.5, 1.0, 3.0, 40.0])
+def test_what_was_learned_lies_in_its_own_interval(factor):
+    """A clip that says nothing leaves what was thought before; the body is moved by the fit of least loss all the same."""
+    _, field, _ = oscillator()
+    theta = np.full(3, math.log(factor))
+    before = np.full(3, 0.3)
+    limits = intervals(field, Posterior(mean=np.zeros(3), covariance=np.diag(before**2), before=before), theta)
+    learned = physical(field, torch.from_numpy(theta))
+    for name, one in limits.items():
+        assert one.low <= learned[name] <= one.high
+        reach = [math.log(end / physical(field, field.zero())[name]) for end in (one.low, one.high)]
+        assert reach == pytest.approx([min(-0.3 * NORMAL, theta[0]), max(0.3 * NORMAL, theta[0])])
 
 
 def test_a_wrong_density_moves_the_stiffness_as_is_said():

@@ -17,6 +17,7 @@ from physics3d.materials.viscoelastic import Viscoelastic
 from physics3d.scenes import finite_elements, reference_motion
 from physics3d.scenes.carnation import CarnationTwin
 from physics3d.world import World
+from pipeline.fingerprint import fingerprint
 from pipeline.settings import compose
 from pipeline.stage import build
 from pipeline.twin import handed_over
@@ -60,6 +61,32 @@ def test_a_clamped_beam_has_the_frequencies_of_timoshenko():
         found = finite_elements.frequencies(beam(), world(branch, 0.1), 2)
         expected = first((1 + branch) * YOUNG)
         assert found == pytest.approx([expected, expected], rel=0.01)
+
+
+def test_a_beam_that_a_box_holds_in_the_middle_is_two_of_half_the_length():
+    """Twice two directions; stubbier ones, whose clamp hinders the section more: 1.5 per cent."""
+    body = replace(beam(), held=np.array([], int))
+    nodes = body.basis.doflocs.T
+    boxes = finite_elements._held(
+        replace(world(1e-9, 0.1), boundaries=(FixedRegion(lower=(-1, -1, 0.0599), upper=(1, 1, 0.0601)),))
+    )
+    body = replace(body, held=np.flatnonzero(finite_elements._inside(boxes, nodes)))
+    found = finite_elements.frequencies(body, world(1e-9, 0.1), 4)
+    area, inertia, shear = section("square", THICK, POISSON)
+    half = timoshenko(LENGTH / 2, area, inertia, YOUNG, POISSON, DENSITY, shear, free=False)[0]
+    assert found == pytest.approx([half] * 4, rel=0.015)
+
+
+@pytest.mark.parametrize("box", [False, True])
+def test_a_push_is_spread_over_the_mass_it_takes_hold_of(box):
+    """The whole force, at the middle of that part: of a beam's upper quarter."""
+    body = beam()
+    where = dict(lower=(-1.0, -1.0, 0.09), upper=(1.0, 1.0, 1.0)) if box else dict(centre=(0, 0, 1.09), radius=1.0)
+    push = Impulse(force=(1.0, 2.0, 3.0), duration=0.1, **where)
+    load = finite_elements._load(body, world(1e-9, 0.1), (push,))[1].reshape(-1, 3)
+    np.testing.assert_allclose(load.sum(0), [1, 2, 3], rtol=1e-9)
+    height = load[:, 0] @ body.basis.doflocs[2] / load[:, 0].sum()
+    assert height == pytest.approx(0.105, abs=1e-4)  # functions of quadratic elements add up to the height itself
 
 
 def test_a_beam_that_was_pushed_swings_as_an_oscillator_with_a_branch():
@@ -117,7 +144,8 @@ def test_a_motion_that_is_kept_is_that_of_its_scene_as_it_is_and_of_no_other(nam
     moved, made = found
     assert "finite elements" in made
     for take in moved.values():
-        still = take.place[:, 2] < world.boundaries[0].upper[2] - 1e-6
+        hold = world.boundaries[0]
+        still = ((take.place > np.array(hold.lower)) & (take.place < np.array(hold.upper) - 1e-6)).all(1)
         np.testing.assert_allclose(take.position[0], take.place, rtol=0, atol=1e-9)  # rounding
         assert np.abs(take.position - take.place)[:, still].max() < 2e-5  # of half precision
         assert np.abs(take.position - take.place).max() > 0.01
@@ -133,6 +161,17 @@ def test_a_motion_that_is_kept_is_that_of_its_scene_as_it_is_and_of_no_other(nam
     assert reference_motion.recorded(kept, world, pokes, thicker, **asked) is None
     for timing in (dict(frames=10_000, fps=twin.fps), dict(frames=5, fps=0.7 * twin.fps)):
         assert reference_motion.recorded(kept, world, pokes, solids, **timing) is None
+
+
+@pytest.mark.parametrize("name", ["carnation", "hat", "bread", "rubber"])
+def test_a_twin_names_the_motion_it_would_take_if_it_were_there(name):
+    """The pipeline remembers which files a source reads: one that is filed later must change what it computes."""
+    config, _ = compose([f"scene={name}"])
+    twin = build(config["scene"]["source"], "cpu", "scene.source")
+    twin = replace(twin, **{"motion" if isinstance(twin, CarnationTwin) else "name": "unheard_of"})
+    (file,) = twin.files()
+    before, after = (fingerprint({"scene": name}, [], files=[("motion", Path(f))]) for f in (file, __file__))
+    assert not Path(file).exists() and before != after
 
 
 def test_a_seed_paints_and_scatters_petals_and_leaves_the_motion():
