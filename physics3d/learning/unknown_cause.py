@@ -15,9 +15,9 @@ from physics3d.journal import Journal
 from physics3d.learning.free_body import estimate, reduced
 from physics3d.learning.free_interval import free_intervals, free_posterior
 from physics3d.learning.free_motion import FreeMotion, Material, Reduced, fit
-from physics3d.learning.identify import identified
+from physics3d.learning.identify import Oscillations, Swing, another_take, identified
 from physics3d.learning.interval import Beyond
-from physics3d.learning.seen_modes import Observed, Sight, observe, sight
+from physics3d.learning.seen_modes import Look, Observed, Sight, observe, observe_again, sight
 from physics3d.log import Log
 from physics3d.modes.model import Model
 from physics3d.motion.decay import Decay, fit_decay
@@ -41,6 +41,23 @@ class Swung:
     sight: Sight
     picture: Tensor  # uint8 [h, w, 3], in which the body is where its Gaussians are
     take: Take
+
+
+@dataclass(frozen=True, kw_only=True)
+class Seen:
+    """What the frames seen of a take show."""
+
+    clip: Observed
+    flow: Float[np.ndarray, "t h w 2"]  # from the picture in which the body is where its Gaussians are [px]
+    weight: Float[np.ndarray, "t n"]  # of the pixels of the sight
+    release: int  # frame from which the thing is free; time 0 of the swing
+    reference: float | None  # time of that picture, in the same clip [s]; None: there the body is at rest
+    swing: Swing
+
+    @property
+    def window(self) -> Observed:
+        """The frames from the release on."""
+        return self.clip.window(self.release, len(self.flow))
 
 
 def frames_seen(take: Take) -> int:
@@ -95,35 +112,61 @@ def found_by(capture: Capture, take: Take, gaussians: Gaussians, log: Log) -> Ca
     return replace(camera, world_to_camera=pose)
 
 
-def first_take(
-    body: Swung, log: Log
-) -> tuple[Observed, Float[np.ndarray, "t h w 2"], Float[np.ndarray, "t n"], Decay, int]:
-    """(sums, flow, its weights, free decay and release of the frames seen)."""
-    frames = body.take.videos[0][: frames_seen(body.take)]
-    clip, u, trusted = observe(body.sight, frames, body.take.fps, reference=body.picture)
+def first_take(body: Swung, log: Log) -> Seen:
+    """The frames seen of the take that is learned from, looked at twice (`observe_again`)."""
+    take, frames = body.take, body.take.videos[0][: frames_seen(body.take)]
+    look = observe(body.sight, frames, take.fps, reference=body.picture)
+    first = _told(body, look, log.hushed())
+    times = (np.arange(first.release, len(frames)) - first.release) / take.fps
+    places = np.stack([first.swing.at(t) for t in times])
+    if first.reference is not None:
+        places -= first.swing.at(first.reference)
+    again = observe_again(body.sight, frames, take.fps, reference=body.picture, seen=first.flow, places=places)
+    return _told(body, again, log)
+
+
+def other_take(
+    body: Swung, take: Take, modes: Oscillations, known: Float[np.ndarray, " m"] | None, *, release: int, seen: int
+) -> Seen:
+    """The first `seen` frames of another take of the same thing, looked at twice. `known`: as for `another_take`."""
+    frames = take.videos[0][:seen]
+    look = observe(body.sight, frames, take.fps, reference=body.picture)
+    first = another_take(body.reduced, look[0].window(release, seen), modes, known)
+    places = np.stack([first.at(i / take.fps) for i in range(seen - release)])
+    places -= 0 if known is None else known
+    clip, u, weight = observe_again(body.sight, frames, take.fps, reference=body.picture, seen=look[1], places=places)
+    swing = another_take(body.reduced, clip.window(release, seen), modes, known)
+    return Seen(clip=clip, flow=u, weight=weight, release=release, reference=None, swing=swing)
+
+
+def _told(body: Swung, look: Look, log: Log) -> Seen:
+    """What a look tells: from where on the thing is free, and its oscillations."""
+    (clip, u, weight), take = look, body.take
     where = moving(u)
     if where is None:
-        raise ValueError(f"take {body.take.name}: nothing moves in the {len(frames)} frames that are seen")
+        raise ValueError(f"take {take.name}: nothing moves in the {len(u)} frames that are seen")
     share = float(where[body.sight.thing].sum() / where.sum())
     if share < BESIDE:
         raise ValueError(
-            f"take {body.take.name}: only {100 * share:.0f} % of what moves is where the thing is seen; the clip shows "
+            f"take {take.name}: only {100 * share:.0f} % of what moves is where the thing is seen; the clip shows "
             "something else that moves, or the prompts name another thing: set scene.prompts"
         )
     where &= body.sight.thing
-    weight = np.ones(u.shape[:3], np.float32)
-    signal = shapes(u, weight, where, count=SHAPES).signal
-    decay, release = free_decay(signal, body.take.fps)
-    later = min(body.take.release, _latest(decay, len(frames), body.take.fps))
+    signal = shapes(u, np.ones(u.shape[:3], np.float32), where, count=SHAPES).signal
+    decay, release = free_decay(signal, take.fps)
+    later = min(take.release, _latest(decay, len(u), take.fps))
     if release < later:
         release = later  # known from elsewhere, a person or the whole clip
-        decay = fit_decay(signal, body.take.fps, first=release)
+        decay = fit_decay(signal, take.fps, first=release)
     if decay.main() is None:
         raise ValueError(
-            f"take {body.take.name}: what moves does not swing; a material is learned from what has been let go"
+            f"take {take.name}: what moves does not swing; a material is learned from what has been let go"
         )
     log.info(f"free from frame {release} on; largest oscillation {decay.frequency[decay.main()]:.3g} Hz")
-    return clip, u, trusted, decay, release
+    assert take.posed is not None
+    reference = None if take.at_rest else (take.posed - release) / take.fps
+    swing = identified(body.reduced, clip.window(release, len(u)), decay, reference=reference, log=log)
+    return Seen(clip=clip, flow=u, weight=weight, release=release, reference=reference, swing=swing)
 
 
 def _latest(decay: Decay, count: int, fps: float) -> int:
@@ -148,16 +191,13 @@ def learned_free(
     """The material, from the frames seen of the first take. `width`: of the stiffness that is likely beforehand, in the
     logarithm; `beyond`: what the frames do not show."""
     ready = swung(world, capture, gaussians, body, zones=zones, log=log)
-    clip, u, trusted, decay, release = first_take(ready, log)
-    assert ready.take.posed is not None
-    reference = None if ready.take.at_rest else ready.take.posed
-    window, at = clip.window(release, len(clip.gram)), None if reference is None else (reference - release) / clip.fps
-    swing = identified(ready.reduced, window, decay, reference=at, log=log)
+    seen = first_take(ready, log)
+    take, release, swing = ready.take, seen.release, seen.swing
     material, motion = fit(
         ready.reduced,
-        clip,
+        seen.clip,
         release=release,
-        reference=reference,
+        reference=None if take.at_rest else take.posed,
         frequency=float(swing.modes.frequency[0]),
         large=swing.large,
         log=log,
@@ -167,11 +207,11 @@ def learned_free(
     after = free_posterior(
         ready.reduced,
         material,
-        window,
+        seen.window,
         sight=ready.sight,
-        flow=u[release:, i, j].astype(float),
-        weight=trusted[release:],
-        reference=at,
+        flow=seen.flow[release:, i, j].astype(float),
+        weight=seen.weight[release:],
+        reference=seen.reference,
         large=swing.large,
         width=width,
         beyond=beyond,
