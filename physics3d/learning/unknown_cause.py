@@ -1,6 +1,7 @@
 """A take whose cause nobody knows: what its camera sees of the body, and the material that makes it swing so."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,6 +30,7 @@ from physics3d.world import Estimate, World
 
 SHAPES = 3  # of the flow, that the clip's frequencies are read off
 LEAST, PERIODS = 12, 1.5  # frames, and of the largest oscillation, that a motion is learned from
+LOOKS, SAME = 3, 0.02  # at the frames after the first, at most; by less of the motion two of them say the same
 BESIDE = 0.05  # of what moves; flow runs over outlines, so that of a thin thing most is beside it
 
 
@@ -53,6 +55,12 @@ class Seen:
     release: int  # frame from which the thing is free; time 0 of the swing
     reference: float | None  # time of that picture, in the same clip [s]; None: there the body is at rest
     swing: Swing
+    since: Float[np.ndarray, " m"]  # amplitudes of the swing in the picture that the flow counts from [m]
+
+    def places(self) -> Float[np.ndarray, "k m"]:
+        """Amplitudes since that picture, in the frames from the release on [m]."""
+        count = len(self.flow) - self.release
+        return np.stack([self.swing.at(i / self.clip.fps) for i in range(count)]) - self.since
 
     @property
     def window(self) -> Observed:
@@ -113,33 +121,43 @@ def found_by(capture: Capture, take: Take, gaussians: Gaussians, log: Log) -> Ca
 
 
 def first_take(body: Swung, log: Log) -> Seen:
-    """The frames seen of the take that is learned from, looked at twice (`observe_again`)."""
-    take, frames = body.take, body.take.videos[0][: frames_seen(body.take)]
-    look = observe(body.sight, frames, take.fps, reference=body.picture)
-    first = _told(body, look, log.hushed())
-    times = (np.arange(first.release, len(frames)) - first.release) / take.fps
-    places = np.stack([first.swing.at(t) for t in times])
-    if first.reference is not None:
-        places -= first.swing.at(first.reference)
-    again = observe_again(body.sight, frames, take.fps, reference=body.picture, seen=first.flow, places=places)
-    return _told(body, again, log)
+    """The frames seen of the take that is learned from. Raises ValueError if nothing swings in them."""
+    frames = body.take.videos[0][: frames_seen(body.take)]
+    seen = _looked_at(body, frames, body.take.fps, lambda look: _told(body, look))
+    said(seen.swing, seen.release, log)
+    return seen
 
 
 def other_take(
     body: Swung, take: Take, modes: Oscillations, known: Float[np.ndarray, " m"] | None, *, release: int, seen: int
 ) -> Seen:
-    """The first `seen` frames of another take of the same thing, looked at twice. `known`: as for `another_take`."""
-    frames = take.videos[0][:seen]
-    look = observe(body.sight, frames, take.fps, reference=body.picture)
-    first = another_take(body.reduced, look[0].window(release, seen), modes, known)
-    places = np.stack([first.at(i / take.fps) for i in range(seen - release)])
-    places -= 0 if known is None else known
-    clip, u, weight = observe_again(body.sight, frames, take.fps, reference=body.picture, seen=look[1], places=places)
-    swing = another_take(body.reduced, clip.window(release, seen), modes, known)
-    return Seen(clip=clip, flow=u, weight=weight, release=release, reference=None, swing=swing)
+    """The first `seen` frames of another take of the same thing, by its camera. `known`: as for `another_take`."""
+
+    def told(look: Look) -> Seen:
+        clip, u, weight = look
+        swing = another_take(body.reduced, clip.window(release, seen), modes, known)
+        since = np.zeros(len(modes.shape)) if known is None else known
+        return Seen(clip=clip, flow=u, weight=weight, release=release, reference=None, swing=swing, since=since)
+
+    return _looked_at(body, take.videos[0][:seen], take.fps, told)
 
 
-def _told(body: Swung, look: Look, log: Log) -> Seen:
+def _looked_at(body: Swung, frames: Tensor, fps: float, told: Callable[[Look], Seen]) -> Seen:
+    """What is told of the frames, looked at again (`observe_again`) until they tell the same."""
+    size = lambda q: float(np.einsum("tm,mn,tn->", q, body.sight.gram, q))
+    seen = told(observe(body.sight, frames, fps, reference=body.picture))
+    places = seen.places()
+    for _ in range(LOOKS):
+        look = observe_again(body.sight, frames, fps, reference=body.picture, seen=seen.flow, places=places)
+        before, seen = places, told(look)
+        places = seen.places()
+        both = min(len(before), len(places))  # the release may be another
+        if size(places[-both:] - before[-both:]) < SAME**2 * size(places[-both:]):
+            break
+    return seen
+
+
+def _told(body: Swung, look: Look) -> Seen:
     """What a look tells: from where on the thing is free, and its oscillations."""
     (clip, u, weight), take = look, body.take
     where = moving(u)
@@ -162,11 +180,11 @@ def _told(body: Swung, look: Look, log: Log) -> Seen:
         raise ValueError(
             f"take {take.name}: what moves does not swing; a material is learned from what has been let go"
         )
-    log.info(f"free from frame {release} on; largest oscillation {decay.frequency[decay.main()]:.3g} Hz")
     assert take.posed is not None
     reference = None if take.at_rest else (take.posed - release) / take.fps
-    swing = identified(body.reduced, clip.window(release, len(u)), decay, reference=reference, log=log)
-    return Seen(clip=clip, flow=u, weight=weight, release=release, reference=reference, swing=swing)
+    swing = identified(body.reduced, clip.window(release, len(u)), decay, reference=reference)
+    since = np.zeros(len(swing.modes.shape)) if reference is None else swing.at(reference)
+    return Seen(clip=clip, flow=u, weight=weight, release=release, reference=reference, swing=swing, since=since)
 
 
 def _latest(decay: Decay, count: int, fps: float) -> int:
@@ -219,6 +237,18 @@ def learned_free(
     )
     found = estimate(world, material, ready.reduced.zone)
     return replace(found, intervals=free_intervals(found, material, after))
+
+
+def said(swing: Swing, release: int, log: Log) -> None:
+    """The oscillations that are seen, in words and numbers."""
+    modes, large = swing.modes, swing.modes.large
+    pairs = ", ".join(f"{f:.3g} Hz (damping {d:.2g} 1/s)" for f, d in zip(modes.frequency, modes.damping))
+    log.info(
+        f"free from frame {release} on; oscillations seen, of small swings: {pairs}; at first they are "
+        f"{100 * large.slower:.1f} % slower and die out {100 * large.sooner:.0f} % faster, as the "
+        f"{'square of the ' if large.exponent == 2 else ''}amplitude"
+    )
+    log.info(f"they explain {100 * (1 - swing.unexplained):.1f} % of the motion that is seen")
 
 
 def report(motion: FreeMotion, material: Material, log: Log) -> None:
