@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from clips import FPS, decaying, swaying, swinging_rod, texture
+from clips import FPS, decaying, swaying, texture, thin_rod
 from scipy import ndimage
 
 from physics3d.metrics.image import likeness, psnr
@@ -26,16 +26,6 @@ def test_flow_is_the_displacement_from_the_reference(reference):
     # what is at the centre of frame r has moved by the difference; DIS is good to a fifth of a pixel on such a texture
     np.testing.assert_allclose(u[:, *CENTRE, 0].mean((1, 2)), shift - shift[reference], atol=0.2)
     np.testing.assert_allclose(u[:, *CENTRE, 1].mean((1, 2)), 0, atol=0.2)
-
-
-def thin_rod(bend, *, width):
-    """(clip of a rod, its displacement at every pixel per px of its tip, the rod's pixels in a frame at rest)."""
-    foot, length = 130, 105
-    video = swinging_rod(bend, foot=foot, length=length, radius=width / 2)
-    y, x = np.mgrid[: video.shape[1], : video.shape[2]].astype(float)
-    up = np.clip((foot - y) / length, 0, 1)
-    rod = (np.abs(x + 0.5 - video.shape[2] / 2) < width / 2) & (up > 0) & (up < 1)
-    return video, up**2 * (6 - 4 * up + up**2) / 3, rod
 
 
 def share_read(u, bend, shape, rod):
