@@ -152,7 +152,7 @@ def _looked_at(body: Swung, frames: Tensor, fps: float, told: Callable[[Look], S
         before, seen = places, told(look)
         places = seen.places()
         both = min(len(before), len(places))  # the release may be another
-        if size(places[-both:] - before[-both:]) < SAME**2 * size(places[-both:]):
+        if size(places[-both:] - before[-both:]) <= SAME**2 * size(places[-both:]):
             break
     return seen
 
