@@ -21,9 +21,8 @@ from physics3d.gaussians.model import Gaussians
 from physics3d.learning.foretold import Moving, foretold, has_stopped
 from physics3d.learning.free_body import material_of
 from physics3d.learning.free_motion import Material, start
-from physics3d.learning.identify import Swing, another_take, identified
-from physics3d.learning.seen_modes import observe
-from physics3d.learning.unknown_cause import Swung, by_its_own_camera, first_take, frames_seen, swung
+from physics3d.learning.identify import Swing
+from physics3d.learning.unknown_cause import Swung, by_its_own_camera, first_take, frames_seen, other_take, swung
 from physics3d.log import Log
 from physics3d.metrics.against import Lines, Reference
 from physics3d.metrics.scores import REFERENCE, Scores
@@ -50,27 +49,23 @@ class Foretell:
         """Rows are "take: prediction". Raises ValueError as `swung` does."""
         require_fields(self, "foretell")
         ready = swung(self.world, capture, gaussians, body, zones=self.zones, log=log)
-        clip, flow, trusted, decay, release = first_take(ready, log)
+        first = first_take(ready, log)
         learned = material_of(self.world, estimate, ready.reduced.zone)
         before = material_of(self.world, self.world.estimate(), ready.reduced.zone)
-        take, posed = ready.take, ready.take.posed
-        assert posed is not None
+        take, swing, release, reference = ready.take, first.swing, first.release, first.reference
         scores: dict[str, dict[str, float | None]] = {}
         notes: dict[str, str] = {}
-        reference = None if take.at_rest else (posed - release) / take.fps
         seen = frames_seen(take)
-        window = clip.window(release, seen)
-        swing = identified(ready.reduced, window, decay, reference=reference, log=log)
         for j in range(len(swing.modes.frequency)):
             log.metric(f"frequency_{j}", float(swing.modes.frequency[j]))
             log.metric(f"damping_{j}", float(swing.modes.damping[j]))
         motions: dict[str, Moving] = {SEEN: swing}
         for name, material in ((LEARNED, learned), (START, before)):
-            motions[name] = start(ready.reduced, material, window, reference=reference, large=swing.large)[0]
+            motions[name] = start(ready.reduced, material, first.window, reference=reference, large=swing.large)[0]
         pose = {name: None if reference is None else motion.at(reference) for name, motion in motions.items()}
-        if has_stopped(ready.sight, swing, flow, trusted, fps=take.fps, release=release):
+        if has_stopped(ready.sight, swing, first.flow, first.weight, fps=take.fps, release=release):
             motions[SEEN] = _stopped(swing, take, notes, log)
-        scores |= self.judged(ready, take, motions, flow, release=release, seen=seen, notes=notes, log=log)
+        scores |= self.judged(ready, take, motions, first.flow, release=release, seen=seen, notes=notes, log=log)
         for other in capture.takes:
             if other is not take:
                 own = ready if other.posed is None else by_its_own_camera(ready, capture, other, gaussians, body, log)
@@ -101,16 +96,15 @@ class Foretell:
         if seen - release < 4:
             notes[take.name] = f"{len(frames)} frames, free from {release} on, are too few to be foretold"
             return {}
-        clip, flow, trusted = observe(ready.sight, frames[:seen], take.fps, reference=ready.picture)
-        window = clip.window(release, seen)
         known = {name: None if take.at_rest else place for name, place in pose.items()}
-        swing = another_take(ready.reduced, window, first.modes, known[SEEN])
-        if has_stopped(ready.sight, swing, flow, trusted, fps=take.fps, release=release):
+        told = other_take(ready, take, first.modes, known[SEEN], release=release, seen=seen)
+        swing = told.swing
+        if has_stopped(ready.sight, swing, told.flow, told.weight, fps=take.fps, release=release):
             swing = _stopped(swing, take, notes, log)
         motions: dict[str, Moving] = {SEEN: swing}
         for name, material in materials.items():
-            motions[name] = start(ready.reduced, material, window, known=known[name], large=swing.large)[0]
-        return self.judged(ready, take, motions, flow, release=release, seen=seen, notes=notes, log=log)
+            motions[name] = start(ready.reduced, material, told.window, known=known[name], large=swing.large)[0]
+        return self.judged(ready, take, motions, told.flow, release=release, seen=seen, notes=notes, log=log)
 
     def judged(
         self,

@@ -76,3 +76,13 @@ def swinging_rod(
         frames.append(inside[..., None] * skin + (1 - inside[..., None]) * wall)
     video = np.stack(frames) + rng.normal(size=(len(frames), h, w, 3))
     return torch.from_numpy(np.clip(video + 0.5, 0, 255).astype(np.uint8))
+
+
+def thin_rod(bend, *, width):
+    """(clip of a rod, its displacement at every pixel per px of its tip, the rod's pixels in a frame at rest)."""
+    foot, length = 130, 105
+    video = swinging_rod(bend, foot=foot, length=length, radius=width / 2)
+    y, x = np.mgrid[: video.shape[1], : video.shape[2]].astype(float)
+    up = np.clip((foot - y) / length, 0, 1)
+    rod = (np.abs(x + 0.5 - video.shape[2] / 2) < width / 2) & (up > 0) & (up < 1)
+    return video, up**2 * (6 - 4 * up + up**2) / 3, rod

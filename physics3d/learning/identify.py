@@ -31,7 +31,6 @@ from scipy import optimize
 from physics3d.learning.free_motion import FAINT, PRIOR, Material, Reduced, modal
 from physics3d.learning.large_swing import LargeSwing
 from physics3d.learning.seen_modes import Observed
-from physics3d.log import Log
 from physics3d.motion.decay import Decay
 
 SPAN = 8  # modes of the model that shapes are made of
@@ -90,7 +89,7 @@ class Swing:
         return replace(self, amplitude=np.zeros_like(self.amplitude))
 
 
-def identified(body: Reduced, clip: Observed, decay: Decay, *, reference: float | None, log: Log) -> Swing:
+def identified(body: Reduced, clip: Observed, decay: Decay, *, reference: float | None) -> Swing:
     """The oscillations of a clip that is free from its first frame on, with its start.
 
     `decay`: of the same frames, with at least one oscillation. The flow counts from the frame at time `reference` [s],
@@ -157,12 +156,6 @@ def identified(body: Reduced, clip: Observed, decay: Decay, *, reference: float 
     one = np.stack([np.linalg.svd(pair)[2][0] for pair in both]) / np.sqrt(space)
     modes = Oscillations(shape=span @ one.T, span=span, frequency=f, damping=d, large=large, power=1.0)
     swing = _start(body, clip, modes, large, known=None, reference=reference)
-    pairs = ", ".join(f"{a:.3g} Hz (damping {b:.2g} 1/s)" for a, b in zip(f, d))
-    log.info(
-        f"oscillations seen, of small swings: {pairs}; at first they are {100 * large.slower:.1f} % slower and die out "
-        f"{100 * large.sooner:.0f} % faster, as the {'square of the ' if large.exponent == 2 else ''}amplitude"
-    )
-    log.info(f"they explain {100 * (1 - swing.unexplained):.1f} % of the motion that is seen")
     return replace(swing, modes=replace(modes, power=_power(body, swing)))
 
 

@@ -25,7 +25,8 @@ from physics3d.gaussians.cameras import Camera
 from physics3d.gaussians.embedding import embed
 from physics3d.gaussians.model import Gaussians
 from physics3d.gaussians.rasterize import rasterize
-from physics3d.motion.flow import flow, trust
+from physics3d.motion.flow import flow_from, trust_from
+from physics3d.motion.flow_about import REACH, flow_about
 
 MOST_PIXELS = 6000  # that are looked at: flow is smooth over its patches
 FADE = 4.0  # over which the motion fades out beyond the outline [px]
@@ -39,10 +40,11 @@ class Sight:
     pixel: Int[np.ndarray, "n 2"]  # row and column of those that are looked at
     jacobian: Float[np.ndarray, "n 2 m"]  # J [px per m]
 
-    def displacement(self, q: Float[np.ndarray, " m"]) -> Float[np.ndarray, "h w 2"]:
-        """What the amplitudes [m] move every pixel by [px]; beyond the outline that of the nearest pixel fades out."""
-        nearest, fading = self._spread
-        return (self.jacobian @ q).astype(np.float32)[nearest] * fading
+    def displacement(self, q: Float[np.ndarray, " m"], *, fade: float = FADE) -> Float[np.ndarray, "h w 2"]:
+        """What the amplitudes [m] move every pixel by [px]; beyond the outline that of the nearest pixel fades out,
+        over `fade` [px]."""
+        nearest, away = self._spread
+        return (self.jacobian @ q).astype(np.float32)[nearest] * np.exp(-((away / fade) ** 2))
 
     @cached_property
     def gram(self) -> Float[np.ndarray, "m m"]:
@@ -51,12 +53,12 @@ class Sight:
 
     @cached_property
     def _spread(self) -> tuple[Int[np.ndarray, "h w"], Float[np.ndarray, "h w 1"]]:
-        """(number of the pixel looked at that is nearest to each pixel, how much of its motion is left there)."""
+        """(number of the pixel looked at that is nearest to each pixel, how far each is from the outline [px])."""
         number = np.full(self.thing.shape, -1)
         number[tuple(self.pixel.T)] = np.arange(len(self.pixel))
         nearest = ndimage.distance_transform_edt(number < 0, return_distances=False, return_indices=True)
         away = ndimage.distance_transform_edt(~self.thing)
-        return number[tuple(nearest)], np.exp(-((away / FADE) ** 2))[..., None].astype(np.float32)
+        return number[tuple(nearest)], away[..., None].astype(np.float32)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,23 +117,46 @@ def sight(gaussians: Gaussians, body: Body, camera: Camera, basis: Float[np.ndar
     return Sight(thing=thing, pixel=pixel, jacobian=jacobian)
 
 
-def observe(
-    sight: Sight, frames: UInt8[Tensor, "t h w 3"], fps: float, *, reference: UInt8[Tensor, "h w 3"]
-) -> tuple[Observed, Float[np.ndarray, "t h w 2"], Float[np.ndarray, "t n"]]:
+Look = tuple[Observed, Float[np.ndarray, "t h w 2"], Float[np.ndarray, "t n"]]
+
+
+def observe(sight: Sight, frames: UInt8[Tensor, "t h w 3"], fps: float, *, reference: UInt8[Tensor, "h w 3"]) -> Look:
     """(the sums of the frames, the flow, the weight of the pixels of the sight) from the picture `reference`, in which
     the body is where its Gaussians are."""
-    video = torch.cat([reference[None], frames])
-    u = flow(video)
-    weight = trust(video, u)[1:]
-    u = u[1:]
+    return _summed(sight, frames, fps, reference, flow_from(reference, frames))
+
+
+def observe_again(
+    sight: Sight,
+    frames: UInt8[Tensor, "t h w 3"],
+    fps: float,
+    *,
+    reference: UInt8[Tensor, "h w 3"],
+    seen: Float[np.ndarray, "t h w 2"],
+    places: Float[np.ndarray, "k m"],
+) -> Look:
+    """The same, once the first look, the flow `seen`, has told where the body is in the last k frames: flow that began
+    from nothing loses a part of what moves wide and is thin. `places`: amplitudes since the picture [m]."""
+    first = len(frames) - len(places)
+    guess = np.stack([sight.displacement(q, fade=REACH) for q in places])
+    u = np.concatenate([seen[:first], flow_about(guess, reference, frames[first:])])
+    return _summed(sight, frames, fps, reference, u)
+
+
+def _summed(
+    sight: Sight,
+    frames: UInt8[Tensor, "t h w 3"],
+    fps: float,
+    reference: UInt8[Tensor, "h w 3"],
+    u: Float[np.ndarray, "t h w 2"],
+) -> Look:
+    weight = trust_from(reference, frames, u)
     i, j = sight.pixel.T
     W, U, J = weight[:, i, j].astype(float), u[:, i, j].astype(float), sight.jacobian
     flat = J.reshape(-1, J.shape[-1])
-    gram = np.stack([_gram(np.sqrt(np.repeat(w, 2))[:, None] * flat) for w in W])
-    right = (W[..., None] * U).reshape(len(U), -1) @ flat
     observed = Observed(
-        gram=gram,
-        right=right,
+        gram=np.stack([_gram(np.sqrt(np.repeat(w, 2))[:, None] * flat) for w in W]),
+        right=(W[..., None] * U).reshape(len(U), -1) @ flat,
         square=(W[..., None] * U**2).sum((1, 2)),
         weight=W.sum(1),
         fps=fps,

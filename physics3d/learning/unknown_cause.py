@@ -1,6 +1,7 @@
 """A take whose cause nobody knows: what its camera sees of the body, and the material that makes it swing so."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,9 +16,9 @@ from physics3d.journal import Journal
 from physics3d.learning.free_body import estimate, reduced
 from physics3d.learning.free_interval import free_intervals, free_posterior
 from physics3d.learning.free_motion import FreeMotion, Material, Reduced, fit
-from physics3d.learning.identify import identified
+from physics3d.learning.identify import Oscillations, Swing, another_take, identified
 from physics3d.learning.interval import Beyond
-from physics3d.learning.seen_modes import Observed, Sight, observe, sight
+from physics3d.learning.seen_modes import Look, Observed, Sight, observe, observe_again, sight
 from physics3d.log import Log
 from physics3d.modes.model import Model
 from physics3d.motion.decay import Decay, fit_decay
@@ -29,6 +30,7 @@ from physics3d.world import Estimate, World
 
 SHAPES = 3  # of the flow, that the clip's frequencies are read off
 LEAST, PERIODS = 12, 1.5  # frames, and of the largest oscillation, that a motion is learned from
+LOOKS, SAME = 3, 0.02  # at the frames after the first, at most; by less of the motion two of them say the same
 BESIDE = 0.05  # of what moves; flow runs over outlines, so that of a thin thing most is beside it
 
 
@@ -41,6 +43,29 @@ class Swung:
     sight: Sight
     picture: Tensor  # uint8 [h, w, 3], in which the body is where its Gaussians are
     take: Take
+
+
+@dataclass(frozen=True, kw_only=True)
+class Seen:
+    """What the frames seen of a take show."""
+
+    clip: Observed
+    flow: Float[np.ndarray, "t h w 2"]  # from the picture in which the body is where its Gaussians are [px]
+    weight: Float[np.ndarray, "t n"]  # of the pixels of the sight
+    release: int  # frame from which the thing is free; time 0 of the swing
+    reference: float | None  # time of that picture, in the same clip [s]; None: there the body is at rest
+    swing: Swing
+    since: Float[np.ndarray, " m"]  # amplitudes of the swing in the picture that the flow counts from [m]
+
+    def places(self) -> Float[np.ndarray, "k m"]:
+        """Amplitudes since that picture, in the frames from the release on [m]."""
+        count = len(self.flow) - self.release
+        return np.stack([self.swing.at(i / self.clip.fps) for i in range(count)]) - self.since
+
+    @property
+    def window(self) -> Observed:
+        """The frames from the release on."""
+        return self.clip.window(self.release, len(self.flow))
 
 
 def frames_seen(take: Take) -> int:
@@ -95,35 +120,71 @@ def found_by(capture: Capture, take: Take, gaussians: Gaussians, log: Log) -> Ca
     return replace(camera, world_to_camera=pose)
 
 
-def first_take(
-    body: Swung, log: Log
-) -> tuple[Observed, Float[np.ndarray, "t h w 2"], Float[np.ndarray, "t n"], Decay, int]:
-    """(sums, flow, its weights, free decay and release of the frames seen)."""
+def first_take(body: Swung, log: Log) -> Seen:
+    """The frames seen of the take that is learned from. Raises ValueError if nothing swings in them."""
     frames = body.take.videos[0][: frames_seen(body.take)]
-    clip, u, trusted = observe(body.sight, frames, body.take.fps, reference=body.picture)
+    seen = _looked_at(body, frames, body.take.fps, lambda look: _told(body, look))
+    said(seen.swing, seen.release, log)
+    return seen
+
+
+def other_take(
+    body: Swung, take: Take, modes: Oscillations, known: Float[np.ndarray, " m"] | None, *, release: int, seen: int
+) -> Seen:
+    """The first `seen` frames of another take of the same thing, by its camera. `known`: as for `another_take`."""
+
+    def told(look: Look) -> Seen:
+        clip, u, weight = look
+        swing = another_take(body.reduced, clip.window(release, seen), modes, known)
+        since = np.zeros(len(modes.shape)) if known is None else known
+        return Seen(clip=clip, flow=u, weight=weight, release=release, reference=None, swing=swing, since=since)
+
+    return _looked_at(body, take.videos[0][:seen], take.fps, told)
+
+
+def _looked_at(body: Swung, frames: Tensor, fps: float, told: Callable[[Look], Seen]) -> Seen:
+    """What is told of the frames, looked at again (`observe_again`) until they tell the same."""
+    size = lambda q: float(np.einsum("tm,mn,tn->", q, body.sight.gram, q))
+    seen = told(observe(body.sight, frames, fps, reference=body.picture))
+    places = seen.places()
+    for _ in range(LOOKS):
+        look = observe_again(body.sight, frames, fps, reference=body.picture, seen=seen.flow, places=places)
+        before, seen = places, told(look)
+        places = seen.places()
+        both = min(len(before), len(places))  # the release may be another
+        if size(places[-both:] - before[-both:]) <= SAME**2 * size(places[-both:]):
+            break
+    return seen
+
+
+def _told(body: Swung, look: Look) -> Seen:
+    """What a look tells: from where on the thing is free, and its oscillations."""
+    (clip, u, weight), take = look, body.take
     where = moving(u)
     if where is None:
-        raise ValueError(f"take {body.take.name}: nothing moves in the {len(frames)} frames that are seen")
+        raise ValueError(f"take {take.name}: nothing moves in the {len(u)} frames that are seen")
     share = float(where[body.sight.thing].sum() / where.sum())
     if share < BESIDE:
         raise ValueError(
-            f"take {body.take.name}: only {100 * share:.0f} % of what moves is where the thing is seen; the clip shows "
+            f"take {take.name}: only {100 * share:.0f} % of what moves is where the thing is seen; the clip shows "
             "something else that moves, or the prompts name another thing: set scene.prompts"
         )
     where &= body.sight.thing
-    weight = np.ones(u.shape[:3], np.float32)
-    signal = shapes(u, weight, where, count=SHAPES).signal
-    decay, release = free_decay(signal, body.take.fps)
-    later = min(body.take.release, _latest(decay, len(frames), body.take.fps))
+    signal = shapes(u, np.ones(u.shape[:3], np.float32), where, count=SHAPES).signal
+    decay, release = free_decay(signal, take.fps)
+    later = min(take.release, _latest(decay, len(u), take.fps))
     if release < later:
         release = later  # known from elsewhere, a person or the whole clip
-        decay = fit_decay(signal, body.take.fps, first=release)
+        decay = fit_decay(signal, take.fps, first=release)
     if decay.main() is None:
         raise ValueError(
-            f"take {body.take.name}: what moves does not swing; a material is learned from what has been let go"
+            f"take {take.name}: what moves does not swing; a material is learned from what has been let go"
         )
-    log.info(f"free from frame {release} on; largest oscillation {decay.frequency[decay.main()]:.3g} Hz")
-    return clip, u, trusted, decay, release
+    assert take.posed is not None
+    reference = None if take.at_rest else (take.posed - release) / take.fps
+    swing = identified(body.reduced, clip.window(release, len(u)), decay, reference=reference)
+    since = np.zeros(len(swing.modes.shape)) if reference is None else swing.at(reference)
+    return Seen(clip=clip, flow=u, weight=weight, release=release, reference=reference, swing=swing, since=since)
 
 
 def _latest(decay: Decay, count: int, fps: float) -> int:
@@ -148,16 +209,13 @@ def learned_free(
     """The material, from the frames seen of the first take. `width`: of the stiffness that is likely beforehand, in the
     logarithm; `beyond`: what the frames do not show."""
     ready = swung(world, capture, gaussians, body, zones=zones, log=log)
-    clip, u, trusted, decay, release = first_take(ready, log)
-    assert ready.take.posed is not None
-    reference = None if ready.take.at_rest else ready.take.posed
-    window, at = clip.window(release, len(clip.gram)), None if reference is None else (reference - release) / clip.fps
-    swing = identified(ready.reduced, window, decay, reference=at, log=log)
+    seen = first_take(ready, log)
+    take, release, swing = ready.take, seen.release, seen.swing
     material, motion = fit(
         ready.reduced,
-        clip,
+        seen.clip,
         release=release,
-        reference=reference,
+        reference=None if take.at_rest else take.posed,
         frequency=float(swing.modes.frequency[0]),
         large=swing.large,
         log=log,
@@ -167,11 +225,11 @@ def learned_free(
     after = free_posterior(
         ready.reduced,
         material,
-        window,
+        seen.window,
         sight=ready.sight,
-        flow=u[release:, i, j].astype(float),
-        weight=trusted[release:],
-        reference=at,
+        flow=seen.flow[release:, i, j].astype(float),
+        weight=seen.weight[release:],
+        reference=seen.reference,
         large=swing.large,
         width=width,
         beyond=beyond,
@@ -179,6 +237,18 @@ def learned_free(
     )
     found = estimate(world, material, ready.reduced.zone)
     return replace(found, intervals=free_intervals(found, material, after))
+
+
+def said(swing: Swing, release: int, log: Log) -> None:
+    """The oscillations that are seen, in words and numbers."""
+    modes, large = swing.modes, swing.modes.large
+    pairs = ", ".join(f"{f:.3g} Hz (damping {d:.2g} 1/s)" for f, d in zip(modes.frequency, modes.damping))
+    log.info(
+        f"free from frame {release} on; oscillations seen, of small swings: {pairs}; at first they are "
+        f"{100 * large.slower:.1f} % slower and die out {100 * large.sooner:.0f} % faster, as the "
+        f"{'square of the ' if large.exponent == 2 else ''}amplitude"
+    )
+    log.info(f"they explain {100 * (1 - swing.unexplained):.1f} % of the motion that is seen")
 
 
 def report(motion: FreeMotion, material: Material, log: Log) -> None:

@@ -19,8 +19,8 @@ STEPS = 8
 MOVED = 0.5  # less needs no start of its own [px]
 
 
-def carried(photograph: UInt8[np.ndarray, "h w 3"], u: Float[np.ndarray, "h w 2"]) -> UInt8[np.ndarray, "h w 3"]:
-    """The photograph with every pixel x at x + u(x) [px]; pixels that do not move keep their exact colour."""
+def carried(photograph: UInt8[np.ndarray, "h w *c"], u: Float[np.ndarray, "h w 2"]) -> UInt8[np.ndarray, "h w *c"]:
+    """The photograph, grey or not, with every pixel x at x + u(x) [px]; pixels that do not move keep their colour."""
     import cv2
 
     v = inverse(u)

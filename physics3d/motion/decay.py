@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 FASTEST = 15.0  # damping of what is still told from a jump [1/s]
+APART = 0.1  # of its rate, that a relaxation is from the next
 FLOOR = 0.01  # flow is not better than that: less is no misfit [px rms]
 
 
@@ -85,9 +86,12 @@ def fit_decay(signal: Float[np.ndarray, "n k"], fps: float, *, first: int = 0, m
             break
         poles = min(tried, key=lambda p: _misfit(s, t, p))
         refined = _refined(s, t, poles)
+        candidates = [c for c in candidates if not np.allclose(c, poles[-1])]
+        if _merged(refined):
+            poles = poles[:-1]
+            continue
         found = _solved(s, t, refined, fps, first)
         cost = _information(found, s)
-        candidates = [c for c in candidates if not np.allclose(c, poles[-1])]
         poles = refined
         if cost < best_cost:
             best, best_cost = found, cost
@@ -185,6 +189,13 @@ def _refined(s: np.ndarray, t: np.ndarray, poles: np.ndarray) -> np.ndarray:
 
     done = least_squares(residual, start, jacobian, bounds=(lower, upper), x_scale=1 / duration, max_nfev=60)
     return _unpacked(done.x, swings)
+
+
+def _merged(poles: np.ndarray) -> bool:
+    """Whether two relaxations have come so near that they are the polynomial t exp(-r t): no creep, but a slow swing of
+    which less than half is seen."""
+    rates = np.sort(poles[poles[:, 0] == 0, 1])
+    return bool((np.diff(rates) < APART * rates[1:]).any())
 
 
 def _solved(s: np.ndarray, t: np.ndarray, poles: np.ndarray, fps: float, first: int) -> Decay:

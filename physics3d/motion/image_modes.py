@@ -21,7 +21,7 @@ from torch import Tensor
 from physics3d.cores import spread
 from physics3d.motion.carry import carried, inverse
 from physics3d.motion.decay import Decay, with_start
-from physics3d.motion.flow import flow, trust
+from physics3d.motion.flow import flow, flow_from, trust
 from physics3d.motion.release import free_decay
 from physics3d.motion.shapes import moving, shapes, signals
 
@@ -91,7 +91,7 @@ def of_another_take(modes: ImageModes, seen: UInt8[Tensor, "t h w 3"], *, first:
             f"frames of {tuple(seen.shape[1:3])} px, the take learned from has {tuple(modes.photograph.shape[:2])}"
         )
     last = len(seen) - 1
-    between = flow(torch.stack([modes.photograph, seen[-1]]))[1]
+    between = flow_from(modes.photograph, seen)[-1]
     shape = np.stack([at(s, inverse(between)) for s in modes.shape])
     u = flow(seen, reference=last)
     s = signals(u, trust(seen, u, reference=last), shape)

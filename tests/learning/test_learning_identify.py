@@ -10,7 +10,6 @@ from test_learning_free_motion import FPS, chain
 from physics3d.learning.foretold import has_stopped
 from physics3d.learning.identify import another_take, identified
 from physics3d.learning.seen_modes import Observed, Sight
-from physics3d.log import Log
 from physics3d.motion.decay import fit_decay
 
 DAMPING = np.array([0.5, 0.8])  # [1/s]
@@ -58,7 +57,7 @@ def test_oscillations_come_back_and_foretell_what_follows(slowing, rubbing, powe
     f, _ = other_system(body)
     places = swung(body, np.array([0.2, 0.12]), slowing, 150, rng, rubbing=rubbing, power=power)
     half = places[:75]
-    swing = identified(body, observed(half, half[-1]), fit_decay(half, FPS), reference=74 / FPS, log=Log(None))
+    swing = identified(body, observed(half, half[-1]), fit_decay(half, FPS), reference=74 / FPS)
     order = np.argsort(swing.modes.frequency)
     # frames of noise of a tenth of the second amplitude; what is likely beforehand draws the slowing a little to zero
     assert swing.modes.frequency[order] == pytest.approx(f, rel=0.01)
@@ -79,7 +78,7 @@ def test_what_creeps_back_is_no_damping_of_small_swings(creep):
     t = np.arange(int(2.5 * FPS / f[0])) / FPS
     q = np.exp(-t) * np.cos(2 * np.pi * f[0] * t) + creep * np.exp(-12 * t)
     places = q[:, None] * shape[:, 0]
-    swing = identified(body, observed(places, places[-1]), fit_decay(places, FPS), reference=t[-1], log=Log(None))
+    swing = identified(body, observed(places, places[-1]), fit_decay(places, FPS), reference=t[-1])
     assert swing.large.sooner >= 0
     assert swing.modes.damping[0] == pytest.approx(1.0, rel=0.1)
 
@@ -95,7 +94,7 @@ def test_what_a_camera_sees_in_part_is_damped_as_it_is(damping):
     places = (np.exp(-damping * t) * np.cos(2 * np.pi * f[0] * t))[:, None] * shape[:, 0]
     places += 1e-3 * rng.standard_normal(places.shape)
     seen = replace(observed(places, places[-1]), weight=np.full(len(t), 8.0 * 10**2 / body.scale**2))
-    swing = identified(body, seen, fit_decay(places, FPS), reference=74 / FPS, log=Log(None))
+    swing = identified(body, seen, fit_decay(places, FPS), reference=74 / FPS)
     assert swing.modes.damping[0] == pytest.approx(damping, rel=0.1, abs=0.05 / t[-1])
 
 
@@ -104,7 +103,7 @@ def test_another_take_has_its_own_start_and_rest():
     body, rng = chain(zones=1), np.random.default_rng(1)
     first = swung(body, np.array([0.2, 0.12]), 0.06, 75, rng)
     known = first[-1]
-    swing = identified(body, observed(first, known), fit_decay(first, FPS), reference=74 / FPS, log=Log(None))
+    swing = identified(body, observed(first, known), fit_decay(first, FPS), reference=74 / FPS)
     rest = 0.03 * np.linspace(0, 1, len(known))
     places = rest + swung(body, np.array([-0.1, 0.1]), 0.06 / 4, 90, rng)
     other = another_take(body, observed(places[:15], known), swing.modes, swing.at(74 / FPS))
@@ -125,7 +124,7 @@ def test_a_take_that_is_damped_otherwise_says_so_as_far_as_it_is_seen(damping):
     )
     noisy = lambda q: q + 0.01 * q.std() * rng.standard_normal(q.shape)
     first = noisy(drawn(f[0], 1.0, 75))
-    swing = identified(body, observed(first, first[-1]), fit_decay(first, FPS), reference=74 / FPS, log=Log(None))
+    swing = identified(body, observed(first, first[-1]), fit_decay(first, FPS), reference=74 / FPS)
     seen = round(1.5 * FPS / f[0])
     places = noisy(drawn(1.02 * f[0], damping, seen))
     other = another_take(body, observed(places, first[-1]), swing.modes, swing.at(74 / FPS))
@@ -136,7 +135,7 @@ def test_a_take_that_is_damped_otherwise_says_so_as_far_as_it_is_seen(damping):
 def test_another_take_that_tells_nothing_is_as_the_first():
     body, rng = chain(zones=1), np.random.default_rng(3)
     first = swung(body, np.array([0.2, 0.12]), 0.0, 75, rng)
-    swing = identified(body, observed(first, first[-1]), fit_decay(first, FPS), reference=74 / FPS, log=Log(None))
+    swing = identified(body, observed(first, first[-1]), fit_decay(first, FPS), reference=74 / FPS)
     still = 0.004 * rng.standard_normal((15, len(body.mass)))
     other = another_take(body, observed(still, first[-1]), swing.modes, swing.at(74 / FPS))
     assert other.modes.damping == pytest.approx(swing.modes.damping, rel=0.1)
@@ -148,7 +147,7 @@ def told_of(body, places, seen):
     known, pixels = places[seen - 1], len(body.mass)
     flow = np.stack([5 * (places[:seen] - known), np.zeros((seen, pixels))], -1)[:, None]
     decay = fit_decay(places[:seen], FPS)
-    swing = identified(body, observed(places[:seen], known), decay, reference=(seen - 1) / FPS, log=Log(None))
+    swing = identified(body, observed(places[:seen], known), decay, reference=(seen - 1) / FPS)
     stopped = has_stopped(sight_of(pixels), swing, flow, np.ones((seen, pixels)), fps=FPS, release=0)
     final = swing.stopped() if stopped else swing
     end = final.at((seen - 1) / FPS)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from clips import decaying
 
 from physics3d.motion.decay import fit_decay, with_start
 from physics3d.motion.release import free_decay
@@ -75,6 +76,17 @@ def test_what_creeps_back_is_no_oscillation(rng):
     assert decay.main() is None and decay.damping[0] == pytest.approx(
         1.5, rel=0.05
     )  # 0.02/2 over 90 frames: one per cent
+
+
+@pytest.mark.parametrize("seed", [27, 28, 38])
+def test_a_slow_swing_is_no_creep_of_which_all_terms_are_one(seed):
+    """Of 0.25 Hz a sixth of a period is seen, which t^2 exp(-r t) tells as well: three relaxations of one rate."""
+    noise = 0.003 * np.random.default_rng(seed).normal(size=(20, 3))
+    decay = fit_decay(
+        decaying(np.arange(20) / FPS, frequency=0.25, phase=-1.2)[:, None] * [1.0, 0.1, 0.02] + noise, FPS
+    )
+    rates = np.sort(decay.damping[decay.frequency == 0])
+    assert (np.diff(rates) > 0.1 * rates[1:]).all()
 
 
 def test_a_start_keeps_frequencies_and_finds_the_amplitudes(rng):

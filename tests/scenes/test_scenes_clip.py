@@ -66,7 +66,7 @@ def test_a_clip_alone_tells_how_the_thing_swings_next(tmp_path):
     assert scores[f"rod: {IMAGE}"]["psnr"] > still["psnr"]
     # a release that is said to be late leaves one and a half periods to be learned from
     late = replace(capture, takes=(replace(take, release=37),))
-    *_, release = first_take(swung(world, late, capture.gaussians, body, zones=1, log=Log(None)), Log(None))
+    release = first_take(swung(world, late, capture.gaussians, body, zones=1, log=Log(None)), Log(None)).release
     assert 1.5 <= (frames_seen(take) - release) * FREQUENCY / FPS < 1.6
 
 
