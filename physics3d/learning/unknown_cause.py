@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -31,6 +32,7 @@ from physics3d.world import Estimate, World
 SHAPES = 3  # of the flow, that the clip's frequencies are read off
 LEAST, PERIODS = 12, 1.5  # frames, and of the largest oscillation, that a motion is learned from
 LOOKS, SAME = 3, 0.02  # at the frames after the first, at most; by less of the motion two of them say the same
+SMALL_SLOPE = 1e-4  # of a field of displacement, whose strain is linear
 BESIDE = 0.05  # of what moves; flow runs over outlines, so that of a thin thing most is beside it
 
 
@@ -232,11 +234,23 @@ def learned_free(
         reference=seen.reference,
         large=swing.large,
         width=width,
-        beyond=beyond,
+        beyond=beyond.shaped(body, *deformed(ready.model, seen.places()), log),
         log=log,
     )
     found = estimate(world, material, ready.reduced.zone)
     return replace(found, intervals=free_intervals(found, material, after))
+
+
+def deformed(
+    model: Model, amplitude: Float[np.ndarray, "k m"]
+) -> tuple[Float[Tensor, "k p 3 3"], Float[Tensor, "k p 3"]]:
+    """F and displacement [m] of the particles, of amplitudes in the body's basis that are made as small as strain is in
+    modes: large ones would count turns as stretch."""
+    q = amplitude.reshape(len(amplitude), model.count, 3)
+    slope = np.einsum("par,kri->kpia", model.slopes.reshape(-1, 3, model.count), q, optimize=True)
+    small = SMALL_SLOPE / max(float(np.abs(slope).max()), 1e-300)
+    displacement = small * np.einsum("pr,kri->kpi", model.values, q, optimize=True)
+    return torch.from_numpy(np.eye(3) + small * slope), torch.from_numpy(displacement)
 
 
 def said(swing: Swing, release: int, log: Log) -> None:

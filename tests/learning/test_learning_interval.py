@@ -137,7 +137,7 @@ def test_a_viscoelastic_oscillator_is_recovered_with_its_intervals():
 
 @pytest.mark.parametrize("factor", [0.02, 0.5, 1.0, 3.0, 40.0])
 def test_what_was_learned_lies_in_its_own_interval(factor):
-    """A clip that says nothing leaves what was thought before; the body is moved by the fit of least loss all the same."""
+    """A clip that says nothing leaves what was thought before; what moves the body is the best fit all the same."""
     _, field, _ = oscillator()
     theta = np.full(3, math.log(factor))
     before = np.full(3, 0.3)
