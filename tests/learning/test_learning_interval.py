@@ -2,12 +2,14 @@
 and whose closed forms are written here."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from scipy import ndimage
 
+from physics3d.filling.doubt import doubt_of, faces
 from physics3d.filling.section import Section
 from physics3d.learning.fields import GlobalField, is_stiff, physical
 from physics3d.learning.interval import NORMAL, Beyond, Posterior, intervals, of_branches, posterior, told, words
@@ -16,6 +18,7 @@ from physics3d.learning.loss import Chain
 from physics3d.learning.polish import polish
 from physics3d.learning.sandwich import Evidence, block_length, blocks, correlation_length, spread
 from physics3d.log import Log
+from physics3d.matter import of_particles
 from physics3d.priors.exemplar import Exemplar
 
 NAMES = ("youngs_modulus", "relaxation_time", "bulk_modulus")
@@ -227,6 +230,31 @@ def test_what_the_clip_does_not_show_widens_the_interval():
     W = Beyond(surface=0.0, grid=0.0).covariance(np.array([1.0, 0.0]), np.zeros(2), np.zeros(2))
     after = after_clip(np.zeros(2), exact, before=np.full(2, 100.0), beyond=W)
     assert np.sqrt(after.covariance.diagonal()) == pytest.approx([math.sqrt(0.02), 0.0], abs=1e-4)
+
+
+def test_a_surface_widens_the_interval_by_what_hangs_on_it_in_the_motion_that_was_filmed(tmp_path):
+    """A bar that is stretched along x, whose four sides are known to `delta`: both stiffness and mass go with its area,
+    and nothing is left of what configuration allows for at least; a width of none is none."""
+    edge, half, delta = 0.002, 0.01, 0.0006
+    one = np.arange(-half + edge / 2, half, edge)
+    x = torch.from_numpy(
+        np.stack(np.meshgrid(np.arange(-0.05, 0.05, edge), one, one, indexing="ij"), -1).reshape(-1, 3)
+    )
+    matter = of_particles(x, torch.full((len(x),), edge**3, dtype=torch.float64))
+    place, side, _ = faces(matter)
+    sides = np.abs(side[:, 0]) < 0.5
+    doubt = doubt_of(matter, place, np.where(sides, delta, 0.0), edge, Log(None))
+    body = SimpleNamespace(position=x, volume=matter.volume, doubt=doubt)
+    F = torch.diag(torch.tensor([1.0001, 1, 1], dtype=torch.float64)).expand(1, len(x), 3, 3)
+    v = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64).expand(1, len(x), 3)
+    found = Beyond(surface=0.05).shaped(body, F, v, Log(tmp_path))
+    # area (2 half)^2: twice delta/half. Pieces at its edges have two faces, which count as one of sqrt(2)
+    corners = (4 * (2 * half / edge - 2) + 4 * math.sqrt(2)) / (4 * 2 * half / edge)
+    ends = 48 / 50  # the first and last pieces look along the bar as well, and count as known here
+    assert found.surface == pytest.approx(2 * delta / half * corners * ends, rel=0.01)
+    assert found.mass == pytest.approx(found.surface, rel=0.01)
+    assert Beyond(surface=0.4).shaped(body, F, v, Log(None)).surface == 0.4
+    assert Beyond(surface=0.0).shaped(body, F, v, Log(None)) == Beyond(surface=0.0)
 
 
 def test_a_branch_is_known_by_what_it_adds():
