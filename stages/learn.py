@@ -31,7 +31,7 @@ from physics3d.gaussians.model import Gaussians
 from physics3d.learning.chain import chain_of, is_forced
 from physics3d.learning.course import Point, history
 from physics3d.learning.curves import curves
-from physics3d.learning.fields import AXES, DENSITY, AbstractField, GlobalField, is_stiff, physical
+from physics3d.learning.fields import AXES, DENSITY, AbstractField, GlobalField, is_elastic, is_stiff, physical
 from physics3d.learning.film_next import film_next
 from physics3d.learning.fit import fit
 from physics3d.learning.imagined import Imagined
@@ -531,4 +531,4 @@ class Learn:
 
 def stiffer(field: GlobalField) -> Tensor:
     """The direction [k] of all moduli together; zero if none is learned."""
-    return torch.tensor([float(name.split("+")[0].endswith("modulus")) for name in field.names]).double()
+    return torch.tensor([float(is_elastic(name)) for name in field.names]).double()

@@ -25,7 +25,8 @@ from physics3d.materials.parameters import check_old_names
 AXES = ("velocity_x", "velocity_y", "velocity_z")
 DENSITY = "density"
 # how names of what scales with the stiffness end
-STIFF = ("modulus", "stress", "viscosity", "consistency", "coefficient")
+ELASTIC = ("modulus", "coefficient")
+STIFF = (*ELASTIC, "stress", "viscosity", "consistency")
 
 
 class AbstractField(Protocol):
@@ -148,6 +149,11 @@ class GlobalField:
 def is_stiff(name: str) -> bool:
     """Whether a parameter scales with the stiffness: it has the unit of a stress, or of a stress times a time."""
     return re.sub(r"_[23]$", "", name.split("+")[0]).endswith(STIFF)
+
+
+def is_elastic(name: str) -> bool:
+    """Whether a parameter is one of those that make a body k times as stiff where all of them are k times as large."""
+    return re.sub(r"_[23]$", "", name.split("+")[0]).endswith(ELASTIC)
 
 
 def is_poissons_ratio(name: str) -> bool:

@@ -31,7 +31,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from physics3d.learning.deformation_field import spread as far_apart
-from physics3d.learning.fields import GlobalField
+from physics3d.learning.fields import GlobalField, is_elastic
 from physics3d.learning.sandwich import Evidence, spread
 from physics3d.log import Log
 
@@ -39,7 +39,6 @@ NODE = "node_"
 WIDTH = 0.7  # of a node's theta before the clip, a standard deviation: half and twice as stiff are usual
 LEAST = 0.02  # of the largest sum of weights, for a node to count; of the largest eigenvalue, for a vector
 LANDMARKS = 500  # particles of which the covariance is taken
-SCALES = ("modulus",)  # what is stiff and made larger alike: names end so
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +81,7 @@ class StiffnessField:
         first, nodes = self._split(theta)
         factor = (self.weights.to(theta) @ nodes).exp()
         values = self.whole.parameters(first)
-        return {name: self._bounded(name, v * factor) if name.endswith(SCALES) else v for name, v in values.items()}
+        return {name: self._bounded(name, v * factor) if is_elastic(name) else v for name, v in values.items()}
 
     def _bounded(self, name: str, value: Float[Tensor, " p"]) -> Float[Tensor, " p"]:
         start = torch.as_tensor(self.whole.start[name]).to(value)
@@ -155,7 +154,7 @@ def picture(X: Float[Tensor, "p 3"], parameters: dict[str, Tensor]) -> Any:
     """The body from two sides, coloured by the first of its moduli that varies."""
     from matplotlib.figure import Figure
 
-    name, value = next((n, v) for n, v in parameters.items() if v.dim() == 1 and n.endswith(SCALES))
+    name, value = next((n, v) for n, v in parameters.items() if v.dim() == 1 and is_elastic(n))
     figure = Figure(figsize=(8, 4), layout="constrained")
     panels = figure.subplots(1, 2)
     for panel, across in zip(panels, (0, 1)):

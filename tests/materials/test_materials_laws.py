@@ -6,7 +6,7 @@ import pytest
 import torch
 from mpm_bodies import every_material
 
-from physics3d.learning.fields import is_stiff
+from physics3d.learning.fields import is_elastic, is_stiff
 from physics3d.materials.base import AbstractMaterial
 from physics3d.materials.material_points import advance
 from physics3d.materials.mixture import Mixture
@@ -210,6 +210,21 @@ def test_stress_grows_with_all_that_has_its_unit(material, rng):
             stress.append(tau / k)
         walked.append(torch.stack(stress))
     torch.testing.assert_close(walked[1], walked[0], rtol=1e-7, atol=1e-9 * float(walked[0].abs().max()))
+
+
+def test_a_stretch_before_anything_flows_grows_with_all_that_is_elastic(material, rng):
+    """What the search over the stiffness and a field of stiffness multiply: by name moduli, those of further branches,
+    and the coefficients of a series. Large stretches where nothing yields, and so fast that no dash-pot moves."""
+    if any(name.endswith("viscosity") for name in material.parameters):
+        pytest.skip("a fluid resists by its viscosity")
+    H = (0.2 if material.recovers else 1e-6) * random(rng, 5, 3, 3)
+    told = []
+    for k in (1.0, 3.7):
+        values = {n: torch.tensor(v * (k if is_elastic(n) else 1.0)).double() for n, v in material.example.items()}
+        c = material.coefficients(placed(material, values, 5)).expand(-1, 5).contiguous()
+        memory = material.initial_memory(5, torch.float64)
+        told.append(advance(material, 1e-12, H / 1e-12, torch.zeros_like(H), c, memory)[1] / k)
+    torch.testing.assert_close(told[1], told[0], rtol=1e-6, atol=1e-8 * float(told[0].abs().max()))
 
 
 def test_no_energy_from_nothing(material, rng):
