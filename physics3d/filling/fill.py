@@ -90,7 +90,7 @@ def fill(
 
     doubt = None
     if surface.doubt is not None and len(position):
-        bounds = ~surface.thin & ~surface.hidden
+        bounds = ~surface.thin & ~surface.hidden & np.isfinite(surface.doubt)
         doubt = doubt_of(matter, surface.point[bounds], surface.doubt[bounds], detail, log)
     bare = _uncovered(surface, deviation, position, view, spacing)
     flat, area = sheet(surface.point[bare], surface.normal[bare], spacing, detail)

@@ -41,6 +41,7 @@ LIMB = 2.0  # deviations by which the outlines of layers of Gaussians lie outsid
 # pictures, 3 the stem of the reconstructed carnation as thick as it is
 FRONT = 2.5
 FRONT_DOUBT = 0.5  # of these
+FACED = 1.0  # cameras that see a surface for it to be known where it is, in the mean over its neighbourhood
 FAR = 1e6  # depth where nothing is seen [m]
 LEAST_SLOPE = 0.33  # of distances that several cameras tell; what is flatter is cut off
 
@@ -54,6 +55,7 @@ class Seen:
     distance: np.ndarray  # [i, j, k] signed, positive outside, cut off at +- truncation [m]
     outline: np.ndarray  # [i, j, k] the same, by outlines alone
     doubt: np.ndarray  # [i, j, k] standard deviation of `distance` near the surface [m]
+    faced: np.ndarray  # [i, j, k] how many cameras see the body there: a surface that outlines alone bound is a guess
     unseen: np.ndarray  # [i, j, k] 1 where no camera looks: more than the truncation behind a surface; else 0
     truncation: float  # [m]
 
@@ -69,8 +71,8 @@ class Seen:
         return self._at(self.unseen, x) > 0.5
 
     def doubt_at(self, x: np.ndarray) -> np.ndarray:
-        """Standard deviation [m] of where the surface is, at points [m, 3] on it."""
-        return self._at(self.doubt, x)
+        """Standard deviation [m] of where the surface is, at points [m, 3] on it; infinite where no camera sees it."""
+        return np.where(self._at(self.faced, x) >= FACED, self._at(self.doubt, x), np.inf)
 
     def distance_at(self, x: np.ndarray) -> np.ndarray:
         """Signed distance of points [m, 3] [m], positive outside, as cameras see it; -truncation where none does."""
@@ -150,12 +152,14 @@ def seen(
     distance = torch.where(unseen, -t, total / looks.clamp_min(1))
     lattice = lambda values: values.reshape(*count).double().numpy()
     smooth = lambda values: ndimage.gaussian_filter(values, 0.7)
+    faced = smooth(lattice(met))
     along = lattice(torch.maximum(distance, outline[-1]))
     return Seen(
         lower=lower,
         h=h,
         distance=smooth(_across(along, h, t)),
-        doubt=FRONT_DOUBT * smooth(lattice(deep)) / smooth(lattice(met)).clip(1e-3) / smooth(_slope(along, h).clip(1)),
+        doubt=FRONT_DOUBT * smooth(lattice(deep)) / faced.clip(1e-3) / smooth(_slope(along, h).clip(1)),
+        faced=faced,
         outline=smooth(lattice(outline[-1])),
         unseen=lattice(unseen & (outline[-1] <= 0)),
         truncation=t,

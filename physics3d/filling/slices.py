@@ -1,4 +1,5 @@
-"""Figure of a filling: three cuts through the middle of the body, Gaussians under its particles."""
+"""Figure of a filling: three cuts through the middle of the body, Gaussians under its particles, and where it ends by
+guess, for no photograph shows that surface."""
 
 import torch
 
@@ -27,9 +28,15 @@ def slices(gaussians: Gaussians, label: torch.Tensor, body: Body):
             at = body.position[near & chosen]
             if len(at) or chosen is not held:
                 panel.scatter(at[:, a], at[:, b], s=8, color=colour, label=name)
+        if body.doubt is not None:
+            guessed = body.doubt.position[~body.doubt.shown]
+            at = guessed[(guessed[:, k] - middle[k]).abs() < body.spacing]
+            if len(at):
+                panel.scatter(at[:, a], at[:, b], s=14, marker="x", color="black", label="no photograph shows it")
         panel.set_aspect("equal")
         panel.set_xlim(body.position[:, a].min() - 2 * body.spacing, body.position[:, a].max() + 2 * body.spacing)
         panel.set_ylim(body.position[:, b].min() - 2 * body.spacing, body.position[:, b].max() + 2 * body.spacing)
         panel.set(title=f"{'xyz'[k]} = {middle[k]:.3f} m", xlabel=f"{'xyz'[a]} [m]", ylabel=f"{'xyz'[b]} [m]")
-    figure.axes[0].legend(loc="upper left", fontsize=8)
+    named = {name: mark for panel in figure.axes for mark, name in zip(*panel.get_legend_handles_labels())}
+    figure.axes[0].legend(named.values(), named.keys(), loc="upper left", fontsize=8)
     return figure

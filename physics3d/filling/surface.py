@@ -41,7 +41,8 @@ class Surface:
     enclosure: "Enclosure"  # where the samples are met by rays
     thin: np.ndarray  # [m] bool: both sides see the sky
     hidden: np.ndarray  # [m] bool: neither side does, or no camera sees a surface near it
-    doubt: np.ndarray | None = None  # [m] standard deviation of where it is, as cameras tell it [m]; None without them
+    # [m] standard deviation of where it is, as cameras tell it [m], infinite where none sees it; None without cameras
+    doubt: np.ndarray | None = None
 
 
 def sample_surface(

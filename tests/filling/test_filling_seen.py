@@ -189,3 +189,17 @@ def test_leaves_that_hide_the_sky_from_each_other_stay_thin(rng):
     body = filled(gaussians, around(32), thickness=0.001)
     # discs at the rim reach one deviation over it; a solid would be several millimetres thick
     assert float(body.volume.double().sum()) == pytest.approx(2 * 0.001 * (side + 0.006) ** 2, rel=0.15)
+
+
+def test_what_outlines_alone_bound_is_shown_by_no_photograph():
+    """Of a ball: all of it by cameras all around; by those above what they see, not the cone that closes it below."""
+    gaussians, cameras, _ = seen_around(*PLAIN)
+    whole = filled(gaussians, cameras).doubt
+    assert whole.shown.float().mean() > 0.99
+    above = [camera for camera in around(64) if camera.centre[2] > 0.2]  # of 0.4: by 30 degrees and more
+    half = filled(gaussians, above).doubt
+    height = half.position[:, 2] / RADIUS
+    assert half.shown[height > 0].float().mean() > 0.95
+    # a camera 30 degrees above the horizon sees down to where normals point 60 degrees below it
+    assert half.shown[height < -0.9].float().mean() < 0.05
+    assert half.volume[~half.shown].sum() > 5 * whole.volume.sum()
