@@ -19,6 +19,7 @@ from typing import Any
 
 from pipeline.fingerprint import installed
 from pipeline.flow import execute, up_to_date
+from pipeline.hired import end_within
 from pipeline.report import report
 from pipeline.settings import CONF, GROUPS, SettingsError, choices, compose, described
 from pipeline.shelf import using
@@ -67,6 +68,7 @@ def main(words: list[str]) -> int:
         for name in (signal.SIGINT, signal.SIGTERM):  # once is enough; a second one ends what libraries do at the end
             signal.signal(name, signal.SIG_DFL)
         print("\ninterrupted; finished stages are kept, the same command goes on from there", file=sys.stderr)
+        end_within(130)
         return 130
     except Exception as error:
         if os.environ.get("PHYSICS3D_TRACEBACK"):

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.flow import Plan, first, plan
+from pipeline.hired import end_within
 from pipeline.settings import SettingsError, compose
 from pipeline.stage import StageError, Step, damage
 from pipeline.words import literal_paths
@@ -66,6 +67,7 @@ def one_line(run: Callable[[], None], error: Callable[[str], None], left: str = 
         return 1
     except KeyboardInterrupt:
         error(f"\ninterrupted; {left}")
+        end_within(130)
         return 130
     return 0
 

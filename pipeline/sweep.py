@@ -37,6 +37,7 @@ from urllib.parse import urlsplit
 from physics3d.cores import usable
 from pipeline.__main__ import quiet, title
 from pipeline.flow import Plan, before, built, first, idle, plan, suit, up_to_date
+from pipeline.hired import end_within
 from pipeline.report import headline
 from pipeline.server import HERE, server
 from pipeline.settings import SettingsError, compose
@@ -122,6 +123,7 @@ def main(words: list[str]) -> int:
         return 1
     except KeyboardInterrupt:
         print("\ninterrupted; finished stages are kept, the same command goes on from there", file=sys.stderr)
+        end_within(130)
         return 130
 
 
