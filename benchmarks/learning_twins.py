@@ -8,10 +8,10 @@ A run is a scene of `conf/scene`, a number of cameras and a seed; these draw, ea
     density              as given, wrong by e^N(0, 0.1)      noise of 2/255 on every pixel, then 8 bits
 
 A body s times as stiff is pushed s a^3 times as hard for 1/sqrt(s) of the time and filmed at sqrt(s) times the rate,
-so that every clip shows about as many swings. The carnation moves as finite elements have found
-(`reference_motion.py`): its shape, q and r are those of the scene, and s is a change of units, in which that motion
-stays exact. The others are moved by the modes, of particles of the solids themselves, at 0.8 of the spacing of those
-that filling puts into the Gaussians.
+so that every clip shows about as many swings. All but the cake move as finite elements have found
+(`reference_motion.py`): their shape, q and r are those of the scene, and s is a change of units, in which that motion
+stays exact. What no such motion is kept of is moved by the modes, of particles of the solids themselves, at 0.8 of the
+spacing of those that filling puts into the Gaussians.
 """
 
 import math
