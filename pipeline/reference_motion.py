@@ -18,6 +18,7 @@ from pipeline.stage import build
 from pipeline.words import literal_paths
 
 EDGE, STEPS = 0.010, 6
+SAME = 0.05  # of the volume: particles of a stem two of them across are counted to a few per cent
 
 
 def main(words: list[str]) -> int:
@@ -50,10 +51,17 @@ def write(words: list[str]) -> None:
     name = source.name if isinstance(source, MadeTwin) else source.motion
     solids = source.solids()
     body = finite_elements.meshed(solids, world, edge)
-    print(f"mesh      {body.gradient.shape[1]} nodes, {1e6 * body.weight.sum():.1f} cm^3", flush=True)
+    place, volume = particles(solids, world.dx / 2, source.seed)
+    meshed, whole = float(body.weight.sum()), float(volume[~body.still(place)].sum())
+    print(f"mesh      {body.gradient.shape[1]} nodes, {1e6 * meshed:.1f} cm^3", flush=True)
+    if abs(meshed / whole - 1) > SAME:
+        raise ValueError(
+            f"the mesh has {1e6 * meshed:.1f} cm^3 where the body has {1e6 * whole:.1f}; a part of it was lost: take a "
+            "smaller edge, or look whether its surfaces are closed"
+        )
     found = finite_elements.frequencies(body, world, 4)
     print(f"stuck     {', '.join(f'{f:.4g}' for f in found)} Hz", flush=True)
-    place = reference_motion.evenly(particles(solids, world.dx / 2, source.seed)[0])
+    place = reference_motion.evenly(place)
     moved = {}
     for role, push in source.pokes().items():
         with tempfile.TemporaryDirectory(prefix="physics3d_") as notes:
