@@ -287,6 +287,10 @@ def legal(key: str, old: Any, new: Any) -> bool | None:
         return None  # there may be no such part or no such force in the scene
     if key == "scene.source.scale" and new is None:
         return None  # some sources can do without
+    if re.search(r"\.rings\.\d+\.0$", key) and new in (-1, 0, 1.5):
+        return True  # degrees above the horizon, or below it
+    if re.search(r"\.rings\.\d+\.1$", key) and new == 0:
+        return None  # a share, if the others add up to one
     if new is None:
         return old is None or bool(NULL_IS_FINE.search(key))
     if isinstance(new, list) or (isinstance(new, float) and math.isnan(new)) or new in (1e30, 10**400, 1e-320):

@@ -68,7 +68,7 @@ class Beyond:
     """
 
     surface: Width = 0.1
-    mass: Width | None = None  # of the mass, by where the surface is; None: half of `surface`
+    mass: Width | None = None  # of the mass, by where that surface is, at least; None: half of `surface`
     grid: Width = 0.15
     modes: Width = 0.05
     density: Width = 0.1  # of the density, as given
@@ -97,7 +97,11 @@ class Beyond:
             f"where the surface is leaves {100 * left.stiffness:.0f} % of the stiffness open in this motion{unshown}, "
             f"and {100 * left.mass:.0f} % of the mass"
         )
-        return replace(self, surface=max(self.surface, left.stiffness), mass=max(self.surface / 2, left.mass))
+        return replace(
+            self,
+            surface=max(self.surface, left.stiffness),
+            mass=max(self.surface / 2 if self.mass is None else self.mass, left.mass),
+        )
 
     def covariance(
         self,

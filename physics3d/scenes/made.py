@@ -71,7 +71,7 @@ class MadeTwin(AbstractSource):
         if not any(shape.full for shape in self.moving.values()):
             raise ValueError("source.moving has no shape that is full; nothing would move, make one of them full")
         if abs(sum(share for _, share in self.rings) - 1) > 1e-6:
-            raise ValueError(f"source.rings is {self.rings}; the shares, the second numbers, must add up to 1")
+            raise ValueError(f"source.rings is {self.rings}; take shares, the second numbers, that add up to 1")
 
     def files(self) -> tuple[str, ...]:
         return (str(path_of(self.name)),)  # even if missing: the pipeline asks once, and would not learn of a new one

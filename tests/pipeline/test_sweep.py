@@ -72,7 +72,9 @@ def test_a_worker_killed_in_the_middle_loses_nothing(folder, prefect, runner, mo
     wanted = Counter([*ALL[:5], *["learn", "simulate", "render", "evaluate"] * 2, "simulate", "render"])  # the guess's
     again = Counter(diary(folder)) - wanted
     assert not wanted - Counter(diary(folder))
-    assert set(again) == {"learn"} and again["learn"] in (1, 2), diary(folder)
+    assert "learn" in again and again.total() <= 2, diary(
+        folder
+    )  # the other worker may be further, if slower ones wait
     results = set((folder / "artifacts").glob("[!.]*/[!.]*"))
     assert before <= results and all(read_manifest(result)["files"] for result in results)
     assert not list((folder / "artifacts").glob("[!.]*/.*"))
