@@ -6,7 +6,8 @@
 Of take 0 the first half is learned from and the second foretold; of the others half a second from the release on is
 seen, in which only their start is sought, and all that follows is foretold. Every prediction stands beside still
 pictures, image modes (flow of what was seen, extrapolated without physics), and the material before it was learned.
-Means over the frames that were foretold. The recordings carry no licence, so no picture of theirs is shown.
+Means over the frames that were foretold. The recordings carry no licence, so no picture of theirs is shown. What was
+seen on the takes, and why some are foretold worse than others: [real takes](../real_takes.md).
 """
 
 import csv
