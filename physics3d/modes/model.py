@@ -20,7 +20,7 @@ from physics3d.journal import Journal
 from physics3d.log import Log
 from physics3d.materials.base import Values
 from physics3d.matter import Matter, in_blocks, in_one_piece, of_particles, points
-from physics3d.modes import basis, cubature, lattice, vibration
+from physics3d.modes import basis, cubature, lattice, vibration, wide
 from physics3d.modes.conditions import Conditions, Refused, conditions
 from physics3d.modes.dynamics import TOLERANCE, Pull, Spring, System
 from physics3d.modes.stress import Points
@@ -33,7 +33,7 @@ MOST_SPLINES = 2500
 BLOCK = 2.5  # edges of a piece: of splines that far apart, what hangs together in the half of it is integrated as one
 PIN = 1e3  # stiffness of a pin, in that of a cube of the piece behind it
 MODES = 12  # of vibration, whose components are fields of the basis
-QUADRATURE = 300  # points of integration
+QUADRATURE = 300  # points of integration, besides those that the modes ask for
 SMOOTH = 30.0  # times the highest mode: what would swing faster is smoothed out of a start
 RIGID = 1e-3  # of the highest mode: what swings slower is a rigid motion, if nothing holds the body
 MOST_GROUPS = 8  # materials that differ; more are a field
@@ -219,25 +219,51 @@ def model(
         affine = (splines.affine() - [0, *at.mean(0)]) * [span, 1, 1, 1] / np.sqrt(weight.sum())
         scalars = np.concatenate([affine, scalars], 1)
     C = basis.independent(scalars, N, G, weight, span)
-    slopes_there, still = G @ C, np.zeros((len(weight), 3, 3))
+    still = np.zeros((len(weight), 3, 3))
     tangent = stuck.tangent(still, vibration.STUCK)
+
+    def in_basis(matrix: sparse.spmatrix) -> np.ndarray:
+        return np.kron(C.T @ (matrix @ C), np.eye(3))
+
+    if swings.any():
+        seen = wide.swings(G, weight, shapes[:, swings], exact[swings])
+        forces = wide.second_order(G, stuck, seen.modes)
+        forces -= M @ (rigid @ (rigid.T @ forces))
+        answers = -_relieved((K + _three(rest) + shift * M).tocsr(), forces, M, rigid)
+        whole = vibration.stiffness(G @ C, tangent) + in_basis(rest + shift * scalar_mass)
+        of_basis = (C.T @ forces.reshape(splines.count, -1)).reshape(len(whole), -1)
+        held_by_basis = of_basis.T @ np.linalg.solve(whole, of_basis)
+        more = wide.missing(answers, forces, held_by_basis, seen.energy)
+        if more.size:
+            C = basis.independent(np.concatenate([scalars, basis.turned(more, G, weight)], 1), N, G, weight, span)
+            log.info(f"{more.shape[1]} fields of the second order, for wide swings")
+    slopes_there = G @ C
+    mass = C.T @ (scalar_mass @ C)
     K = vibration.stiffness(slopes_there, tangent)
     group = _groups(coefficients)
-    if group.max() + 1 > MOST_GROUPS:  # a field of parameters: every particle counts
+    if group.max() + 1 > MOST_GROUPS or len(weight) <= 1.5 * points_:  # a field of parameters: every particle counts
         which, factor = np.arange(len(weight)), np.ones(len(weight))
     else:
-        whole = K + np.kron(C.T @ (rest @ C), np.eye(3))
-        _, own_modes = vibration.dense_modes(whole, np.kron(C.T @ (scalar_mass @ C), np.eye(3)), modes, shift=shift)
+        whole = K + in_basis(rest + shift * scalar_mass)
+        square, own_modes = vibration.dense_modes(whole, np.kron(mass, np.eye(3)), len(exact), shift=0.0)
+        seen = wide.swings(slopes_there, weight, own_modes[:, swings], square[swings])
         which, factor = journal.ask(
             "points of integration",
             whole,
             points_,
-            answer=lambda: cubature.chosen(slopes_there, tangent, whole, own_modes, group, points_),
+            answer=lambda: cubature.chosen(
+                slopes_there,
+                tangent,
+                whole,
+                own_modes[:, :modes],
+                wide.works(slopes_there, stuck, seen, whole, points_ // 2),
+                group,
+                points_ - points_ // 2,
+            ),
         )
     slopes_there = np.ascontiguousarray(slopes_there.reshape(len(weight), 3, -1)[which].reshape(3 * len(which), -1))
     K = vibration.stiffness(slopes_there, tangent[:, which] * factor[:, None, None])
-    K += np.kron(C.T @ (permanent @ C), np.eye(3))
-    mass = C.T @ (scalar_mass @ C)
+    K += in_basis(permanent)
     lowest, shapes = vibration.dense_modes(K, np.kron(mass, np.eye(3)), len(exact), shift=shift)
     off = np.abs(np.sqrt(np.maximum(lowest[swings] / exact[swings], 0))[:4] - 1)
     log.info(
@@ -288,7 +314,12 @@ def _responses(K: sparse.csr_matrix, sources: list[np.ndarray], M: sparse.csr_ma
     bends = np.abs(relieved).max(0) > 1e-6 * np.abs(columns).max(0)
     if not bends.any():
         return np.zeros((K.shape[0], 0))
-    found = vibration.Factor(K)(relieved[:, bends])
+    return _relieved(K, relieved[:, bends], M, rigid)
+
+
+def _relieved(K: sparse.csr_matrix, forces: np.ndarray, M: sparse.csr_matrix, rigid: np.ndarray) -> np.ndarray:
+    """K^-1 forces, without rigid motions."""
+    found = vibration.Factor(K)(forces)
     return found - rigid @ (rigid.T @ (M @ found))
 
 
