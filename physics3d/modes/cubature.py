@@ -7,7 +7,8 @@ apart.
 with a_z, b_z random states of the basis in coordinates in which its stiffness is the identity: all of them have the
 same energy, so that bending is integrated as well as stretching, which is a thousand times stiffer. A set of factors
 that integrates enough random products integrates all. So it does for small strain; in a wide swing stretches cancel
-that by themselves are large, and the work of some such swings is among the products (`wide.py`). Factors that are not negative keep every energy an energy.
+that by themselves are large, and the work of some such swings is among the products (`wide.py`). Factors that are not
+negative keep every energy an energy.
 Non-negative least squares leaves at most as many points as there are products. An, Kim and James (2008), Farhat et al.
 (2014).
 """
@@ -32,9 +33,9 @@ def chosen(
     seed: int = 0,
 ) -> tuple[Int[np.ndarray, " c"], Float[np.ndarray, " c"]]:
     """(which of n points, the factors of their weights), at most about `count` and as many as there are `works`; K is
-    the stiffness with all points, `modes` of vibration, whose products are integrated with more weight than random ones,
-    `works` at the points those of wide swings, in units in which states have the energy of a half.
-    Points of different `group`, of other materials, are integrated each by their own."""
+    the stiffness with all points, `modes` of vibration, whose products are integrated with more weight than random
+    ones, `works` at the points those of wide swings, in units in which states have the energy of a half. Points of
+    different `group`, of other materials, are integrated each by their own."""
     rng = np.random.default_rng(seed)
     n, r = len(group), gradient.shape[1]
     value, vector = linalg.eigh((K + K.T) / 2)
@@ -71,7 +72,10 @@ def chosen(
         # candidates by the energy they hold: what bends at a narrow foot bends nowhere else
         share = np.linalg.norm(Y * scale, axis=1)
         take = rng.choice(
-            len(own), min(CANDIDATES * Y.shape[1], len(own)), replace=False, p=(share + share.mean()) / (2 * share.sum())
+            len(own),
+            min(CANDIDATES * Y.shape[1], len(own)),
+            replace=False,
+            p=(share + share.mean()) / (2 * share.sum()),
         )
         solution = _not_negative((Y[take] * scale).T, target * scale)
         kept = solution > 0

@@ -1,11 +1,11 @@
-"""What a body does besides when it swings widely: fields of the second order, and the work by which they are integrated.
+"""What a body does besides when it swings widely: fields of the second order, and the work that integrates them.
 
     f(u) = K u + f2(u, u)/2 + ...,        f2 symmetric: f(u) + f(-u) = f2(u, u) + what is of the fourth order
     u(q) = sum_i q_i phi_i + 1/2 sum_ij q_i q_j psi_ij,        psi_ij = -K^-1 f2(phi_i, phi_j)
 
 A strip that bends far shortens, a coil that swings out unwinds. The psi_ij say so; they are the modal derivatives of
-Idelsohn and Cardona (1985) and of Barbic and James (2005). A basis that lacks them must stretch the body instead, and is
-too stiff: by 1/8 psi_ij K psi_ij q^4, of what of psi_ij it does not hold. Where this is little, nothing is added.
+Idelsohn and Cardona (1985) and of Barbic and James (2005). A basis that lacks them must stretch the body instead, and
+is too stiff: by 1/8 psi_ij K psi_ij q^4, of what of psi_ij it does not hold. Where this is little, nothing is added.
 
 All modes are looked at with the same energy, that at which the first of them turns by WIDE, so that those that are
 stiff swing less.
@@ -107,12 +107,12 @@ def works(
 
     def pose() -> np.ndarray:
         q = rng.standard_normal(seen.modes.shape[1])
-        q /= np.linalg.norm(q)
+        q = q / np.linalg.norm(q)
         while True:
             H = slopes((seen.modes @ q + psi @ (q[i] * q[j] / (1 + (i == j))))[:, None])[..., 0]
             if np.linalg.det(H + np.eye(3)).min() > FLAT:
                 return H
-            q /= 2
+            q = q / 2
 
     found: list[np.ndarray] = []
     while len(found) < count:

@@ -1,4 +1,4 @@
-"""Wide swings: against a closed form, the sum over all points of integration, and finite elements of another library."""
+"""Wide swings: against a closed form, the sum over all points of integration, and another library's finite elements."""
 
 from dataclasses import dataclass, replace
 from functools import cache
