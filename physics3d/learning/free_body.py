@@ -29,7 +29,14 @@ def reduced(world: World, body: Body, *, zones: int, scale: float, log: Log) -> 
     if "youngs_modulus" not in start or not set(BRANCH) <= set(start) or f"{BRANCH[0]}_2" in start:
         raise ValueError(f"world.material is {type(world.material).__name__} with {sorted(start)}; {needs}")
     solver = Solver.of(
-        world, body.position, body.volume, excitation=body.held, matter=body.matter, modes=MODES, log=log
+        world,
+        body.position,
+        body.volume,
+        excitation=body.held,
+        matter=body.matter,
+        modes=MODES,
+        swings_widely=False,
+        log=log,
     )
     model = solver.model
     points = Points(world.material, solver.coefficients(start).numpy(), model.weight)

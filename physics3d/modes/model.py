@@ -117,11 +117,12 @@ def model(
     matter: Matter | None = None,
     modes: int = MODES,
     points_: int = QUADRATURE,
+    swings_widely: bool = True,
     log: Log,
 ) -> Model:
     """The model of particles at `position` [p, 3] m of `volume` [p] m^3, each a cube of the body unless `matter` says
-    better. `parameters` are those whose modes of vibration the basis is made of. Raises Refused (a ValueError) where
-    a boundary needs the grid."""
+    better. `parameters` are those whose modes of vibration the basis is made of. One that does not swing widely needs
+    no fields of the second order (`wide.py`). Raises Refused (a ValueError) where a boundary needs the grid."""
     x, V = position.detach().cpu().double(), volume.detach().cpu().double()
     lower, upper = ((float(a), float(b), float(c)) for a, b, c in (x.amin(0), x.amax(0)))
     setting = Setting(position=x, mass=world.density * V, volume=V, lower=lower, upper=upper, dx=world.dx)
@@ -225,7 +226,7 @@ def model(
     def in_basis(matrix: sparse.spmatrix) -> np.ndarray:
         return np.kron(C.T @ (matrix @ C), np.eye(3))
 
-    if swings.any():
+    if swings_widely and swings.any():
         seen = wide.swings(G, weight, shapes[:, swings], exact[swings])
         forces = wide.second_order(G, stuck, seen.modes)
         forces -= M @ (rigid @ (rigid.T @ forces))
@@ -244,9 +245,14 @@ def model(
     if group.max() + 1 > MOST_GROUPS or len(weight) <= 1.5 * points_:  # a field of parameters: every particle counts
         which, factor = np.arange(len(weight)), np.ones(len(weight))
     else:
-        whole = K + in_basis(rest + shift * scalar_mass)
-        square, own_modes = vibration.dense_modes(whole, np.kron(mass, np.eye(3)), len(exact), shift=0.0)
-        seen = wide.swings(slopes_there, weight, own_modes[:, swings], square[swings])
+        whole = K + in_basis(rest)
+        square, own_modes = vibration.dense_modes(whole, np.kron(mass, np.eye(3)), len(exact), shift=shift)
+        of_works = points_ // 2 if swings_widely and swings.any() else 0
+
+        def works() -> np.ndarray:
+            seen = wide.swings(slopes_there, weight, own_modes[:, swings], square[swings])
+            return wide.works(slopes_there, stuck, seen, whole + shift * np.kron(mass, np.eye(3)), of_works)
+
         which, factor = journal.ask(
             "points of integration",
             whole,
@@ -256,9 +262,9 @@ def model(
                 tangent,
                 whole,
                 own_modes[:, :modes],
-                wide.works(slopes_there, stuck, seen, whole, points_ // 2),
+                works() if of_works else np.zeros((len(weight), 0)),
                 group,
-                points_ - points_ // 2,
+                points_ - of_works,
             ),
         )
     slopes_there = np.ascontiguousarray(slopes_there.reshape(len(weight), 3, -1)[which].reshape(3 * len(which), -1))

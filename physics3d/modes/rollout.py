@@ -94,9 +94,11 @@ class Solver:
         matter: Matter | None = None,
         modes: int = MODES,
         points: int = QUADRATURE,
+        swings_widely: bool = True,
         log: Log,
     ) -> "Solver":
-        """`part` [p] where the material is a mixture. Raises ValueError as `rollout` does."""
+        """`part` [p] where the material is a mixture. Where a body is asked for its vibrations alone, it need not swing
+        widely. Raises ValueError as `rollout` does."""
         world.check()
         _check_body(position, volume)
         start: Values = {name: torch.tensor(value, dtype=torch.float64) for name, value in world.start.items()}
@@ -111,6 +113,7 @@ class Solver:
             matter=matter,
             modes=modes,
             points_=points,
+            swings_widely=swings_widely,
             log=log,
         )
         return cls(world=world, position=position, volume=volume, model=built)

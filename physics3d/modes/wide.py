@@ -106,7 +106,7 @@ def works(
         return (gradient @ states.reshape(-1, 3 * states.shape[1])).reshape(points.n, 3, 3, -1)
 
     def pose() -> np.ndarray:
-        q = rng.standard_normal(seen.modes.shape[1])
+        q: np.ndarray = rng.standard_normal(seen.modes.shape[1:])
         q = q / np.linalg.norm(q)
         while True:
             H = slopes((seen.modes @ q + psi @ (q[i] * q[j] / (1 + (i == j))))[:, None])[..., 0]
