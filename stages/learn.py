@@ -190,7 +190,7 @@ class Learn:
             world = replace(world, solver="grid")
             chain = replace(chained(whole, log, world), journal=chain.journal)
             theta, course = self.searched(chain, whole, log) if self.search else (whole.zero(), [])
-        if chain.on_grid and self.world.solver == "auto":  # otherwise said already
+        if chain.too_stiff is None and self.world.solver == "auto":  # otherwise said already
             say_resolution(section, self.world.dx, log)
         polished = self.polish > 0 and chain.comparable
         steps = self.steps
@@ -243,7 +243,11 @@ class Learn:
                 field, theta, chain, seen = finer, more, over, shown(over, finer, more, seed=self.seed)
                 said = self.said(finer, seen, log)
                 known = {name: [*known.get(name, []), *curve] for name, curve in history(finer, descent).items()}
-        beyond = self.beyond.of(section, self.world.dx, on_grid=chain.on_grid)
+        beyond = self.beyond.of(section, self.world.dx, None if chain.too_stiff is None else chain.too_stiff())
+        if beyond.grid > self.beyond.modes and chain.too_stiff is not None:
+            log.info(
+                f"splines further apart say that stiffness is up to {100 * beyond.grid:.0f} % off by their distance"
+            )
         if seen is not None:
             motion = chain.motion(theta)
             beyond = beyond.shaped(body, motion.deformation, motion.velocity, log)

@@ -123,7 +123,7 @@ def chain_of(
         passes_a_wall=lambda theta: motion.passes_a_wall(
             part(per_mass(field.parameters(theta), -field.heavier(theta))), velocity=field.velocity(theta), **timing
         ),
-        on_grid=motion.modes is None,
+        too_stiff=None if motion.modes is None else motion.modes.model.too_stiff,
         journal=Journal(log),
     )
 

@@ -96,7 +96,7 @@ def free_posterior(
         theta - likely,
         told(evidence, before=before, log=log),
         before=before,
-        beyond=replace(beyond, grid=beyond.modes).covariance(stiff, none, none, branch),
+        beyond=beyond.covariance(stiff, none, none, branch),
     )
 
 

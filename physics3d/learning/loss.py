@@ -51,7 +51,8 @@ class Chain:
     # what could be filmed next, in words -> what makes its motions by theta, of as many frames; takes time when called
     recordings: Mapping[str, Callable[[], Callable[[Tensor], Any]]] = field(default_factory=dict)
     passes_a_wall: Callable[[Tensor], bool] = lambda theta: False  # that `simulate` does not feel
-    on_grid: bool = True  # whether a grid moves the body, whose resolution a stiffness then hangs on
+    # relative error of the stiffness where no grid moves the body, whose cells it would hang on; takes time when called
+    too_stiff: Callable[[], float] | None = None
     journal: Journal = field(default_factory=lambda: Journal(Log(None)))
 
     @cached_property

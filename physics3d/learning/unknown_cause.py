@@ -234,7 +234,9 @@ def learned_free(
         reference=seen.reference,
         large=swing.large,
         width=width,
-        beyond=beyond.shaped(body, *deformed(ready.model, seen.places()), log),
+        beyond=beyond.of(None, world.dx, ready.model.too_stiff()).shaped(
+            body, *deformed(ready.model, seen.places()), log
+        ),
         log=log,
     )
     found = estimate(world, material, ready.reduced.zone)

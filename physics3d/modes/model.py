@@ -7,7 +7,7 @@ Built once, with the parameters that the world starts from; a learned material m
 """
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -37,6 +37,11 @@ QUADRATURE = 300  # points of integration, besides those that the modes ask for
 SMOOTH = 30.0  # times the highest mode: what would swing faster is smoothed out of a start
 RIGID = 1e-3  # of the highest mode: what swings slower is a rigid motion, if nothing holds the body
 MOST_GROUPS = 8  # materials that differ; more are a field
+# two resolutions: splines so many times as far apart, so many modes of theirs, and the least power of their distance by
+# which a stiffness is wrong (the brim of the hat has one of 3)
+APART = 1.5
+LOOKED_AT = 4
+ORDER = 2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,6 +64,7 @@ class Model:
     omega: np.ndarray  # of the modes with all dash-pots stuck [1/s]
     shapes: np.ndarray  # their amplitudes [m, r, 3], of unit mass
     exact_omega: np.ndarray  # the same of the splines, before the reduction [1/s]
+    coarser: Callable[[], "Model"]  # of the same body, by splines APART times as far from each other, of few modes
 
     @functools.cached_property
     def projection(self) -> np.ndarray:
@@ -89,6 +95,21 @@ class Model:
             tolerance=TOLERANCE[self.world.dtype],
         )
 
+    def too_stiff(self) -> float:
+        """How much stiffer the first modes are than those of the same body by splines as near as one likes, about, in
+        the mean over the energies that known loads give them: judged by coarser splines, for an error in the h-th
+        power of their distance is 1/(APART^h - 1) of what the two differ by. Takes a few seconds."""
+        held = any(spring.pull is None for spring in self.springs)
+        which = slice(0 if held else 6, LOOKED_AT if held else 6 + LOOKED_AT)  # no rigid motion of a free body
+        here, there = self.exact_omega[which], self.coarser().exact_omega[which]
+        if len(here) != len(there) or not here.size:  # of a few splines
+            return 0.0
+        error = np.abs(np.square(there / here) - 1) / (APART**ORDER - 1)
+        pushes = [load.acceleration.double().numpy() for load in self.conditions.loads]
+        work = [np.einsum("mri,r,i->m", self.shapes[which], f, a) for f, a in zip(self.load_fields, pushes)]
+        energy = np.square(work).sum(0) / np.square(here) if work else np.zeros(len(here))
+        return float(np.average(error, weights=energy if energy.sum() > 0 else None))
+
     def modes(self, coefficients: np.ndarray, count: int | None) -> list[vibration.Mode]:
         """Frequencies and loss factors of the lowest modes of vibration, `count` of them or all; their shapes are those
         of this material with stuck dash-pots."""
@@ -118,16 +139,19 @@ def model(
     modes: int = MODES,
     points_: int = QUADRATURE,
     swings_widely: bool = True,
+    cells: Sequence[float] = CELL,
     log: Log,
 ) -> Model:
     """The model of particles at `position` [p, 3] m of `volume` [p] m^3, each a cube of the body unless `matter` says
     better. `parameters` are those whose modes of vibration the basis is made of. One that does not swing widely needs
-    no fields of the second order (`wide.py`). Raises Refused (a ValueError) where a boundary needs the grid."""
+    no fields of the second order (`wide.py`). `cells`: spacings of the splines, in edges of a piece, of which the first
+    serves that is not too near. Raises Refused (a ValueError) where a boundary needs the grid."""
     x, V = position.detach().cpu().double(), volume.detach().cpu().double()
     lower, upper = ((float(a), float(b), float(c)) for a, b, c in (x.amin(0), x.amax(0)))
     setting = Setting(position=x, mass=world.density * V, volume=V, lower=lower, upper=upper, dx=world.dx)
     if matter is None:
         matter = of_particles(x, V)
+    whole_matter = matter
     found = conditions(boundaries, setting, in_one_piece(matter))
     matter = found.matter
     size = matter.size
@@ -136,7 +160,7 @@ def model(
     free = np.flatnonzero(seat >= 0)
     pins = found.pins
     single, block = matter, np.arange(len(matter.position))
-    for cell in CELL:
+    for cell in cells:
         if cell >= BLOCK:
             matter, block = in_blocks(single, cell / 2 * size)
         at, weight, piece = points(matter)
@@ -293,6 +317,20 @@ def model(
         omega=np.sqrt(np.maximum(lowest, 0)),
         shapes=shapes.T.reshape(-1, C.shape[1], 3),
         exact_omega=np.sqrt(np.maximum(exact, 0)),
+        coarser=functools.partial(
+            model,
+            world,
+            position,
+            volume,
+            parameters=parameters,
+            boundaries=boundaries,
+            matter=whole_matter,
+            modes=LOOKED_AT,
+            points_=len(weight),
+            swings_widely=False,
+            cells=(APART * cell,),
+            log=Log(None),
+        ),
     )
 
 

@@ -279,10 +279,12 @@ def test_what_moved_the_body_decides_how_far_its_resolution_is_trusted():
     """A cantilever is 14, 4.9 and 2.9 % wrong in frequency with 1, 2 and 3 cells across, twice that in E
     (docs/results/simulation.md); without a grid nothing hangs on cells."""
     section = Section(centre=np.zeros(3), thickness=0.01, spacing=0.002)
-    width = lambda dx, on_grid: Beyond().of(section, dx, on_grid=on_grid).grid
-    assert [width(dx, True) for dx in (0.01, 0.005, 0.01 / 3)] == pytest.approx([0.28, 0.15, 0.15], abs=0.01)
-    assert {width(dx, False) for dx in (0.01, 0.005)} == {Beyond().modes}
-    assert Beyond().of(None, 0.01, on_grid=True) == Beyond()
+    width = lambda dx, too_stiff: Beyond().of(section, dx, too_stiff).grid
+    assert [width(dx, None) for dx in (0.01, 0.005, 0.01 / 3)] == pytest.approx([0.28, 0.15, 0.15], abs=0.01)
+    assert {width(dx, 0.01) for dx in (0.01, 0.005)} == {Beyond().modes}
+    assert width(0.01, 0.2) == 0.2  # coarse splines
+    assert Beyond(modes=0.0).of(section, 0.01, 0.2).grid == 0.0  # the truth has the same
+    assert Beyond().of(None, 0.01, None) == Beyond()
 
 
 def test_what_a_descent_left_undone_widens_the_interval():
