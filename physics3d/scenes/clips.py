@@ -22,6 +22,7 @@ from physics3d.scenes.base import Take
 from physics3d.scenes.unposed import VIDEOS
 from physics3d.video import reduced
 
+FRAMES = 240  # that are used of a clip: eight seconds of a telephone, in 4 GB
 ALIKE = 0.7  # correlation of two pictures of one view; measured: 0.94 or more, other things 0.35 or less
 COARSE = 48  # longer side of the pictures that are compared [px]
 FLAT = 2.0  # standard deviation of a picture that tells nothing [grey levels]
@@ -114,11 +115,13 @@ def filmed_takes(
     """
     takes = []
     for number, file in enumerate(clip_files(path, pattern)):
-        clip = read_clip(file, fps=fps, longest_side=longest_side)
+        clip = read_clip(file, fps=fps, longest_side=longest_side, most=FRAMES)
         for note in clip.notes:
             log.info(f"{file.name}: {note}")
         found = check_clip(clip, box=box)
         log.info(f"{file.name}: {len(clip.frames)} frames at {clip.fps:g} fps; {found.said()}")
+        for doubt in found.doubts:
+            log.warn(f"{file.name}: {doubt}")
         takes.append(
             FilmedTake(
                 name=file.stem,

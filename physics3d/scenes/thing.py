@@ -25,7 +25,7 @@ from physics3d.checks import Colour, Direction, Every, Length, Name, Pixels, Rat
 from physics3d.motion.clip import read_clip
 from physics3d.scenes.axes import Axes
 from physics3d.scenes.base import AbstractSource, Capture, Take
-from physics3d.scenes.clips import FilmedTake, clip_files, filmed_takes
+from physics3d.scenes.clips import FRAMES, FilmedTake, clip_files, filmed_takes
 from physics3d.scenes.colmap import ColmapSource
 from physics3d.scenes.frames import VIDEOS
 from physics3d.scenes.lens import Lens, undistorted
@@ -149,10 +149,11 @@ class ThingSource(AbstractSource):
 
         for number, (clip, take) in enumerate(zip(clips, takes)):
             first = min(take.rest, len(take.video) - 2)  # a piece of a clip has two frames or more
-            start, stop = max(0.0, (first - 0.5) / take.fps), (first + 1.5) / take.fps
-            piece = read_clip(clip, fps=take.fps, longest_side=self.longest_side, start=start, stop=stop).frames
+            piece = read_clip(
+                clip, fps=self.fps, longest_side=self.longest_side, most=FRAMES, first=first, count=2
+            ).frames
             name = f"{number:03d}.png"
-            Image.fromarray(piece[min(take.rest - first, len(piece) - 1)].numpy()).save(target / name)
+            Image.fromarray(piece[take.rest - first].numpy()).save(target / name)
             yield f"{target.name}/{name}", clip.name
 
 
