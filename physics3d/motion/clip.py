@@ -65,7 +65,7 @@ def read_clip(
     program = ffmpeg()
     if not path.is_file():
         raise ValueError(f"no clip at {path}; check the path")
-    if fps is not None and not 0 < fps < 1000:
+    if fps is not None and not 0 < fps <= 100_000:
         raise ValueError(f"fps is {fps:g}; give frames per second above 0, or leave it out")
     path = path.absolute()  # no name is then an option or a protocol of ffmpeg
     header, times = _header(program, path), _times(program, path)
@@ -76,7 +76,10 @@ def read_clip(
         if fps is None and len(_decoded(program, source, [], path)) < 2:
             raise ValueError(f"{path.name}: 1 frame; that is a picture, a motion needs a clip")
         if fps is None:
-            raise ValueError(f"{path.name}: the rate is unknown, its frames have no times; say it: scene.source.fps=30")
+            raise ValueError(
+                f"{path.name}: the rate is unknown, its frames have no times; say it, scene.source.fps=30, or make "
+                "an mp4 of it that has them"
+            )
         source = ["-r", f"{fps:.6f}", *source]
     else:
         stored, uneven = _rate(times)

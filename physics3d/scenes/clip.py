@@ -18,7 +18,7 @@ import torch
 from annotated_types import Ge, Gt, Lt
 from jaxtyping import Bool, Float
 
-from physics3d.checks import LeftTopRightBottom, Length, Name, Pixels, Positive, Share, Text, require_fields
+from physics3d.checks import LeftTopRightBottom, Length, Name, Pixels, Rate, Share, Text, require_fields
 from physics3d.gaussians.cameras import Camera, look_at
 from physics3d.motion.thing import moving_thing
 from physics3d.scenes.base import AbstractSource, Capture, Take
@@ -36,7 +36,7 @@ class ClipSource(AbstractSource):
     camera_distance: Length  # from the thing [m]; sets the size of everything
     box: Annotated[tuple[Share, Share, Share, Share], LeftTopRightBottom()] = (0.02, 0.02, 0.98, 0.98)
     pattern: Text = "*"  # of the names of clips in a folder
-    fps: Positive | None = None  # None: as the file says [1/s]
+    fps: Rate | None = None  # at which the clips were filmed [1/s]; None: what their files say
     opening: Annotated[float, Gt(0), Lt(170)] = 50.0  # of the lens, along the longer side [deg]
     longest_side: Annotated[Pixels, Ge(64)] = 640  # frames are reduced to this [px]
 

@@ -89,7 +89,8 @@ def clip_files(path: Path, pattern: str = "*") -> list[Path]:
         clips = (p for p in path.iterdir() if p.suffix.lower() in VIDEOS and p.is_file() and p.name[0] != ".")
         found = sorted(p for p in clips if fnmatchcase(p.name, pattern))
         if not found:
-            raise ValueError(f"{path} holds no clip {pattern} ({', '.join(VIDEOS)}); put one there")
+            named = "" if pattern == "*" else f" {pattern}"
+            raise ValueError(f"{path} holds no clip{named} ({', '.join(VIDEOS)}); put one there")
         alike = [p.name for p in found if [q.stem for q in found].count(p.stem) > 1]
         if alike:
             raise ValueError(f"{path} holds {' and '.join(alike)}, whose takes would have one name; rename all but one")

@@ -43,7 +43,7 @@ class ThingSource(AbstractSource):
     name: Name
     path: Text  # the folder of photographs, or of one video around the thing, with the subfolder clips
     camera_distance: Length  # of the photographs from what they look at, in the middle [m]; sets the size of everything
-    fps: Rate | None = None  # of the clips [1/s]; None: what their files say
+    fps: Rate | None = None  # at which the clips were filmed [1/s]; None: what their files say
     # taken from a video: the sharpest of each of so many stretches; photographs are used whole
     frames: Annotated[int, Ge(3), Le(100_000)] = 60
     longest_side: Annotated[Pixels, Ge(64)] = 1200  # photographs are reduced to this [px]

@@ -12,7 +12,7 @@ from clips import FPS, decaying, encode, swaying
 from physics3d.log import Log
 from physics3d.motion.clip import read_clip
 from physics3d.motion.usable import check_clip
-from physics3d.scenes.clips import clip_files, filmed_takes
+from physics3d.scenes.clips import FRAMES, clip_files, filmed_takes
 from physics3d.video import ffmpeg
 
 SECONDS = 2.0
@@ -307,6 +307,14 @@ def test_takes_of_a_folder_are_one_to_learn_and_others_to_predict(tmp_path, sway
         takes[0].seen_by(dataclasses.replace(camera, width=64))
     with pytest.raises(ValueError, match="no clip"):
         filmed_takes(tmp_path / "empty", log=Log(None))
+
+
+def test_a_take_has_no_more_frames_than_memory_and_minutes_allow(tmp_path):
+    shift = decaying(np.arange(2 * FRAMES) / 60, damping=0.4, amplitude=3.0)
+    encode(swaying(shift, h=48, w=64), tmp_path / "fast.mp4", fps=60)
+    (take,) = filmed_takes(tmp_path / "fast.mp4", log=Log(None))
+    assert len(take.video) == FRAMES and take.fps == 30
+    assert take.decay.frequency[take.decay.main()] == pytest.approx(2.0, rel=0.03)
 
 
 def test_clips_of_a_folder_are_files_that_fit_and_have_names_of_their_own(tmp_path):
