@@ -50,17 +50,19 @@ def read_clip(
     *,
     fps: float | None = None,
     longest_side: int | None = SIDE,
+    piece: tuple[float, float] | None = None,
     most: int | None = None,
     first: int = 0,
     count: int | None = None,
 ) -> Clip:
     """`count` frames from the `first` on (None: all), no side longer than `longest_side` px.
 
-    `fps`: the rate at which it was filmed; None: what the times of its frames say. `most`: frames that are used, of
-    which `first` and `count` choose; None: all.
+    fps    the rate at which it was filmed [1/s]; None: what the times of its frames say
+    piece  from when to when it is used, as a player shows the time [s]; None: all of it
+    most   frames that are used of that piece, of which `first` and `count` choose; None: all
 
     Raises ValueError in one line: no such file, unreadable, damaged, no video in it, fewer than two frames, rate
-    unknown, too large to hold; RuntimeError if there is no ffmpeg.
+    unknown, nothing in the piece, too large to hold; RuntimeError if there is no ffmpeg.
     """
     program = ffmpeg()
     if not path.is_file():
@@ -91,8 +93,11 @@ def read_clip(
     notes += _colours(header) + ["interlaced: one frame is made of each two fields"] * interlaced
     filters = ["bwdif=mode=send_frame:deint=interlaced"] if interlaced else []
     filters.append(f"fps={stored:.6f}")
-    filmed = stored if fps is None else fps
-    every, last, bounded = _bounded(filmed, len(times), most)
+    filmed, frame_count = stored if fps is None else fps, len(times)
+    if piece is not None:
+        frame_count = _within(piece, times, path)
+        filters.append(f"trim=start={piece[0]:.6f}:end={piece[1]:.6f}")
+    every, last, bounded = _bounded(filmed, frame_count, most)
     notes += bounded
     last = last if count is None else min(last or first + count, first + count)
     filters += [f"framestep={every}"] * (every > 1)
@@ -122,6 +127,20 @@ def _bounded(fps: float, count: int, most: int | None) -> tuple[int, int | None,
             f"its first {most * every / fps:.3g} s are used, of {count / fps:.3g}; cut it if the motion is later"
         )
     return every, most, notes
+
+
+def _within(piece: tuple[float, float], times: np.ndarray, path: Path) -> int:
+    """How many frames there are in a piece. Raises ValueError for fewer than two, or where frames have no times."""
+    if len(times) < 2:
+        raise ValueError(f"{path.name}: no piece can be taken of it, its frames have no times; make an mp4 of it")
+    since = times - times[0]
+    count = int(((since >= piece[0]) & (since < piece[1])).sum())
+    if count < 2:
+        raise ValueError(
+            f"{path.name}: {count} frames from {piece[0]:g} to {piece[1]:g} s; it lasts {since[-1]:.2f} s, name a "
+            "piece of that"
+        )
+    return count
 
 
 def _rate(times: np.ndarray) -> tuple[float, str]:

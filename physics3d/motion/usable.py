@@ -72,7 +72,8 @@ def check_clip(clip: Clip, *, box: tuple[float, float, float, float] | None = No
     cut = cut_at(small)
     if cut is not None:
         raise ValueError(
-            f"{name}: there is a cut before frame {cut} ({cut / clip.fps:.2f} s); hand over one piece of it"
+            f"{name}: there is a cut before frame {cut} ({cut / clip.fps:.2f} s); hand over one piece of it, or "
+            "name it by scene.source.pieces"
         )
     last = len(small) - 1
     u = flow(small, reference=last)

@@ -72,6 +72,26 @@ def test_size_and_piece_are_chosen(tmp_path, sway):
     assert torch.equal(piece.frames, clip.frames[15:45])
 
 
+def test_a_piece_is_used_as_a_player_shows_its_times(tmp_path, sway):
+    encode(sway, tmp_path / "clip.mp4")
+    whole = read_clip(tmp_path / "clip.mp4")
+    for fps in (None, 240):  # slow motion is played slowly
+        used = read_clip(tmp_path / "clip.mp4", fps=fps, piece=(0.5, 1.5))
+        assert torch.equal(used.frames, whole.frames[15:45])
+        two = read_clip(tmp_path / "clip.mp4", fps=fps, piece=(0.5, 1.5), first=7, count=2)
+        assert torch.equal(two.frames, used.frames[7:9])
+    with pytest.raises(ValueError, match=r"0 frames from 2\.5 to 3 s; it lasts 1\.97 s"):
+        read_clip(tmp_path / "clip.mp4", piece=(2.5, 3.0))
+    black = torch.cat([0 * sway[:15], sway])  # begins in black: a cut, unless the piece leaves it out
+    encode(black, tmp_path / "black.mp4")
+    with pytest.raises(ValueError, match=r"a cut before frame 15 .*scene\.source\.pieces"):
+        filmed_takes(tmp_path / "black.mp4", log=Log(None))
+    (take,) = filmed_takes(tmp_path / "black.mp4", pieces={"black": (0.5, 9.0)}, log=Log(None))
+    assert len(take.video) == len(sway)
+    with pytest.raises(ValueError, match=r"source\.pieces names poke, which is none of the clips; take black"):
+        filmed_takes(tmp_path / "black.mp4", pieces={"poke": (0.5, 9.0)}, log=Log(None))
+
+
 def test_a_rate_that_is_given_is_that_of_the_camera(tmp_path, sway):
     """Slow motion: every frame that was filmed is in the file, at another rate than it was filmed at."""
     encode(sway, tmp_path / "slow.mp4")
