@@ -98,8 +98,8 @@ collect: $(ready) ## remove the results that no run in MLflow refers to (delete 
 score: $(ready) ## any two videos compared: REAL=<clip> PRED=<clip> [OUT=<folder>]
 	@$(threads) $(py) -m pipeline.score
 
-twin: $(ready) ## a thing with known material as photographs and clips on disk: OUT=<new folder>
-	@$(threads) $(py) -m pipeline.twin
+twin: $(ready) ## a thing with known material as photographs and clips on disk: OUT=<new folder> [ARGS="seed=1 youngs_modulus=3e5"]
+	@$(threads) $(with_args) -m pipeline.twin
 
 reference-motion: $(ready) ## how a twin moves by finite elements, kept for its scene; pip install pytetwild pyvista
 	@$(threads) $(with_args) -m pipeline.reference_motion $(of_run)

@@ -17,10 +17,9 @@ def to_uint8(image: Tensor) -> Tensor:
 
 def contact_sheet(frames: UInt8[Tensor, "t h w 3"], *, columns: int = 6, count: int = 12) -> UInt8[Tensor, "H W 3"]:
     """`count` frames evenly spaced in time, laid out in a grid: a video one can look at as a picture."""
-    count = min(count, len(frames))
-    columns = min(columns, count)
-    picks = frames[torch.linspace(0, len(frames) - 1, count).round().long()]
-    rows = -(-count // columns)
+    picks = evenly(frames, count)
+    columns = min(columns, len(picks))
+    rows = -(-len(picks) // columns)
     t, h, w, _ = picks.shape
     sheet = torch.full((rows * columns, h, w, 3), 255, dtype=torch.uint8)
     sheet[:t] = picks
@@ -36,6 +35,16 @@ def titled(frames: UInt8[Tensor, "t h w 3"], title: str) -> UInt8[Tensor, "t k w
     ImageDraw.Draw(strip).text((2, 1), title, fill="black")
     letters = torch.from_numpy(np.array(strip)).to(frames.device)
     return torch.cat([letters.expand(t, -1, -1, -1), frames], 1)
+
+
+def difference(a: UInt8[Tensor, "*t h w 3"], b: UInt8[Tensor, "*t h w 3"]) -> UInt8[Tensor, "*t h w 3"]:
+    """How far two pictures are apart: white where they are not, in bytes throughout."""
+    return 255 - (torch.maximum(a, b) - torch.minimum(a, b))
+
+
+def evenly(frames: UInt8[Tensor, "t h w 3"], count: int) -> UInt8[Tensor, "n h w 3"]:
+    """So many frames, or as many as there are, evenly spaced in time."""
+    return frames[torch.linspace(0, len(frames) - 1, min(count, len(frames))).round().long()]
 
 
 def space_time_slice(frames: UInt8[Tensor, "t h w 3"], *, row: int | None = None, column: int | None = None) -> Tensor:

@@ -15,6 +15,7 @@ from pipeline.places import folder_to_fill, place
 from pipeline.settings import SettingsError
 
 USAGE = "make score REAL=<clip> PRED=<clip> [OUT=<folder>]: any two videos of one motion, from the same camera"
+SHOWN = 8  # frames
 
 
 def main(environment: Mapping[str, str]) -> int:
@@ -41,7 +42,7 @@ def score(real: Path, predicted: Path, folder: Path) -> None:
     from physics3d.metrics.scores import Scores
     from physics3d.motion.clip import read_clip
     from physics3d.motion.stills import stills
-    from physics3d.pictures import contact_sheet, titled
+    from physics3d.pictures import contact_sheet, difference, evenly, titled
 
     pair = paired(read_clip(real), read_clip(predicted))
     whole = Reference(pair.real, pair.fps)
@@ -78,10 +79,10 @@ def score(real: Path, predicted: Path, folder: Path) -> None:
     lines = {name: of_frames for name, (_, of_frames, _) in measured.items()}
     log.image("curves", curves(lines, pair.fps, first=seen))
     log.image("slices", slices(["real", "prediction"], [pair.real, pair.predicted], *busiest(pair.real)))
-    difference = 255 - (pair.real.int() - pair.predicted.int()).abs().to(pair.real.dtype)
-    named = {"real": pair.real, "prediction": pair.predicted, "difference": difference}
-    strips = [titled(clip, name) for name, clip in named.items()]
-    log.image("frames", contact_sheet(torch.cat(strips, 1), columns=8, count=8))
+    a, b = evenly(pair.real, SHOWN), evenly(pair.predicted, SHOWN)
+    named = {"real": a, "prediction": b, "difference": difference(a, b)}
+    strips = [titled(few, name) for name, few in named.items()]
+    log.image("frames", contact_sheet(torch.cat(strips, 1), columns=SHOWN, count=SHOWN))
     pictures = (("frames", "real, prediction, difference"), ("curves", "per frame"), ("slices", "space-time slices"))
     text += ["", *(f"![{what}](previews/{name}.png)" for name, what in pictures)]
     done.write_text("\n".join(text) + "\n")

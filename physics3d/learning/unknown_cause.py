@@ -240,7 +240,18 @@ def learned_free(
         log=log,
     )
     found = estimate(world, material, ready.reduced.zone)
+    assumed(world, found, beyond, log)
     return replace(found, intervals=free_intervals(found, material, after))
+
+
+def assumed(world: World, found: Estimate, beyond: Beyond, log: Log) -> None:
+    """What a motion without a known force does not tell, in words."""
+    ratio = float(found.parameters["youngs_modulus"].double().mean()) / world.density
+    log.info(
+        f"the motion tells E/rho, {ratio:.3g} m^2/s^2, times a length squared; assumed: its density is "
+        f"{world.density:g} kg/m^3 within {100 * beyond.density:.0f} % (scene.density, or scene.thing for what it is "
+        f"made of), and sizes are right within {100 * beyond.length:.0f} %"
+    )
 
 
 def deformed(

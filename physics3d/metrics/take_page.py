@@ -17,7 +17,7 @@ from physics3d.log import Log
 from physics3d.metrics.against import Lines
 from physics3d.metrics.pictures import busiest, curves, slices
 from physics3d.metrics.scores import markdown_table
-from physics3d.pictures import contact_sheet, titled
+from physics3d.pictures import contact_sheet, difference, evenly, titled
 from physics3d.video import write_mp4
 
 PICTURES = {  # what previews of a take are called after its name -> what they show
@@ -48,10 +48,11 @@ def take_page(
     if log.folder is None:
         return
     past, future = recorded[:seen], recorded[seen:]
-    difference = 255 - (future.int() - clips[best].int()).abs().to(torch.uint8)
-    came, told, apart = titled(future, "recorded"), titled(clips[best], best), titled(difference, "difference")
-    write_mp4(log.path(f"{name}.mp4"), torch.cat([came, told], 2), fps)
-    log.image(f"{name}_frames", contact_sheet(torch.cat([came, told, apart], 1), columns=SHOWN, count=SHOWN))
+    write_mp4(log.path(f"{name}.mp4"), torch.cat([titled(future, "recorded"), titled(clips[best], best)], 2), fps)
+    came, told = evenly(future, SHOWN), evenly(clips[best], SHOWN)
+    named = {"recorded": came, best: told, "difference": difference(came, told)}
+    strips = [titled(few, title) for title, few in named.items()]
+    log.image(f"{name}_frames", contact_sheet(torch.cat(strips, 1), columns=SHOWN, count=SHOWN))
     whole = {"recorded": recorded} | {key: torch.cat([past, clips[key]]) for key in (best, bar)}
     log.image(f"{name}_slices", slices(list(whole), list(whole.values()), *busiest(recorded), mark=seen))
     log.image(f"{name}_curves", curves(lines, fps, first=seen))

@@ -32,7 +32,7 @@ class Shapes:
 
 def moving(u: Float[np.ndarray, "t h w 2"]) -> Bool[np.ndarray, "h w"] | None:
     """M, or None if nothing moves (no pixel by half a pixel)."""
-    farthest = size(u).max(0)
+    farthest = np.maximum.reduce([size(frame) for frame in u])
     largest = float(np.percentile(farthest, 99.9))
     return None if largest < LEAST else farthest > STILL * largest
 

@@ -13,7 +13,8 @@ FIRST, LAST, MEAN = "frame 0, frozen", "last frame seen, frozen", "mean of the f
 
 
 def stills(video: UInt8[Tensor, "t h w 3"], *, seen: int) -> dict[str, UInt8[Tensor, "n h w 3"]]:
-    """Name -> clip of the frames from `seen` on. Raises ValueError unless 0 < seen < t."""
+    """Name -> clip of the frames from `seen` on, all of them views of one picture. Raises ValueError unless
+    0 < seen < t."""
     if not 0 < seen < len(video):
         raise ValueError(f"seen is {seen} of {len(video)} frames; leave some to be predicted, e.g. {len(video) // 2}")
     mean = torch.zeros(video.shape[1:], dtype=torch.float64)
@@ -21,4 +22,4 @@ def stills(video: UInt8[Tensor, "t h w 3"], *, seen: int) -> dict[str, UInt8[Ten
         mean += frame
     pictures = {FIRST: video[0], LAST: video[seen - 1], MEAN: (mean / seen + 0.5).to(torch.uint8)}
     count = len(video) - seen
-    return {name: picture.expand(count, *picture.shape).contiguous() for name, picture in pictures.items()}
+    return {name: picture.expand(count, *picture.shape) for name, picture in pictures.items()}

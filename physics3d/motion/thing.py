@@ -52,8 +52,10 @@ def moving_thing(
     size = np.sqrt((weight * (u**2).sum(-1)).sum(0) / weight.sum(0))
     allowed = np.ones(size.shape, bool) if box is None else inside(box, *size.shape)
     size = size / max(float(np.percentile(size, 99.5)), 1e-6)
-    soft = np.stack([cv2.GaussianBlur(frame.astype(np.float32), (0, 0), LOW_PASS) for frame in frames.numpy()])
-    change = np.sqrt(((soft - soft[at]) ** 2).mean(-1)).max(0)
+    soft = lambda frame: cv2.GaussianBlur(frame.astype(np.float32), (0, 0), LOW_PASS)
+    there, change = soft(frames[at].numpy()), np.zeros(size.shape, np.float32)
+    for frame in frames.numpy():  # one at a time: all of them are gigabytes
+        change = np.maximum(change, np.sqrt(((soft(frame) - there) ** 2).mean(-1)))
     changed = cv2.dilate((change > max(3 * float(np.median(change)), CHANGED)).astype(np.uint8), np.ones((3, 3))) > 0
     label = np.full(size.shape, cv2.GC_BGD, np.uint8)
     label[allowed & (size > STILL)] = cv2.GC_PR_BGD

@@ -9,7 +9,7 @@ of the first clip, where several are given; the others show the same thing by th
 The first half of each clip is seen. What the answer says of stiffness holds for the size and the thickness assumed.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
@@ -18,11 +18,11 @@ import torch
 from annotated_types import Ge, Gt, Lt
 from jaxtyping import Bool, Float
 
-from physics3d.checks import LeftTopRightBottom, Length, Name, Pixels, Positive, Share, Text, require_fields
+from physics3d.checks import LeftTopRightBottom, Length, Name, Pixels, Rate, Share, Text, require_fields
 from physics3d.gaussians.cameras import Camera, look_at
 from physics3d.motion.thing import moving_thing
 from physics3d.scenes.base import AbstractSource, Capture, Take
-from physics3d.scenes.clips import FilmedTake, clip_files, filmed_takes
+from physics3d.scenes.clips import FilmedTake, Pieces, clip_files, filmed_takes
 from physics3d.scenes.one_view import one_view
 
 HELD = 0.93  # of the largest distance along the thing, counted less where it moves
@@ -36,7 +36,8 @@ class ClipSource(AbstractSource):
     camera_distance: Length  # from the thing [m]; sets the size of everything
     box: Annotated[tuple[Share, Share, Share, Share], LeftTopRightBottom()] = (0.02, 0.02, 0.98, 0.98)
     pattern: Text = "*"  # of the names of clips in a folder
-    fps: Positive | None = None  # None: as the file says [1/s]
+    fps: Rate | None = None  # at which the clips were filmed [1/s]; None: what their files say
+    pieces: Pieces = field(default_factory=dict)  # of clips that are not used whole, by their names without endings [s]
     opening: Annotated[float, Gt(0), Lt(170)] = 50.0  # of the lens, along the longer side [deg]
     longest_side: Annotated[Pixels, Ge(64)] = 640  # frames are reduced to this [px]
 
@@ -51,6 +52,7 @@ class ClipSource(AbstractSource):
             log=log,
             pattern=self.pattern,
             fps=self.fps,
+            pieces=self.pieces,
             longest_side=self.longest_side,
             box=self.box,
         )

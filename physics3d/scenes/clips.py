@@ -6,14 +6,19 @@ it is registered with the photographs (`FilmedTake.seen_by`), and the excitation
 release the motion is free, and learning finds the state it starts from.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
+from types import MappingProxyType
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Ge, Le
 from jaxtyping import Bool, UInt8
 from torch import Tensor
 
+from physics3d.checks import Ascending, Unit
 from physics3d.gaussians.cameras import Camera
 from physics3d.motion.clip import SIDE, read_clip
 from physics3d.motion.decay import Decay
@@ -22,6 +27,9 @@ from physics3d.scenes.base import Take
 from physics3d.scenes.unposed import VIDEOS
 from physics3d.video import reduced
 
+Second = Annotated[float, Ge(0), Le(100_000), Unit("s")]
+Pieces = Mapping[str, Annotated[tuple[Second, Second], Ascending()]]  # name of a clip -> from when to when it is used
+FRAMES = 240  # that are used of a clip: eight seconds of a telephone, in 4 GB
 ALIKE = 0.7  # correlation of two pictures of one view; measured: 0.94 or more, other things 0.35 or less
 COARSE = 48  # longer side of the pictures that are compared [px]
 FLAT = 2.0  # standard deviation of a picture that tells nothing [grey levels]
@@ -88,7 +96,8 @@ def clip_files(path: Path, pattern: str = "*") -> list[Path]:
         clips = (p for p in path.iterdir() if p.suffix.lower() in VIDEOS and p.is_file() and p.name[0] != ".")
         found = sorted(p for p in clips if fnmatchcase(p.name, pattern))
         if not found:
-            raise ValueError(f"{path} holds no clip {pattern} ({', '.join(VIDEOS)}); put one there")
+            named = "" if pattern == "*" else f" {pattern}"
+            raise ValueError(f"{path} holds no clip{named} ({', '.join(VIDEOS)}); put one there")
         alike = [p.name for p in found if [q.stem for q in found].count(p.stem) > 1]
         if alike:
             raise ValueError(f"{path} holds {' and '.join(alike)}, whose takes would have one name; rename all but one")
@@ -104,21 +113,29 @@ def filmed_takes(
     log,
     pattern: str = "*",
     fps: float | None = None,
+    pieces: Pieces = MappingProxyType({}),
     longest_side: int = SIDE,
     box: tuple[float, float, float, float] | None = None,
 ) -> list[FilmedTake]:
-    """A clip, or a folder of clips of one thing: the first is learned from, the others are predicted.
+    """A clip, or a folder of clips of one thing: the first is learned from, the others are predicted. Of those that
+    `pieces` names, without their endings, a part is used.
 
     Raises ValueError in one line, before anything costs minutes, for a clip that cannot be read or used (see
     `motion/clip.py` and `motion/usable.py`), and RuntimeError where there is no ffmpeg.
     """
-    takes = []
-    for number, file in enumerate(clip_files(path, pattern)):
-        clip = read_clip(file, fps=fps, longest_side=longest_side)
+    takes, files = [], clip_files(path, pattern)
+    unknown = sorted(set(pieces) - {file.stem for file in files})
+    if unknown:
+        names = ", ".join(file.stem for file in files)
+        raise ValueError(f"source.pieces names {unknown[0]}, which is none of the clips; take {names}")
+    for number, file in enumerate(files):
+        clip = read_clip(file, fps=fps, piece=pieces.get(file.stem), longest_side=longest_side, most=FRAMES)
         for note in clip.notes:
             log.info(f"{file.name}: {note}")
         found = check_clip(clip, box=box)
         log.info(f"{file.name}: {len(clip.frames)} frames at {clip.fps:g} fps; {found.said()}")
+        for doubt in found.doubts:
+            log.warn(f"{file.name}: {doubt}")
         takes.append(
             FilmedTake(
                 name=file.stem,

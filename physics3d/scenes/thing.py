@@ -13,7 +13,7 @@ balance of a video are not those of photographs, and the thing is still some pix
 
 import tempfile
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -25,7 +25,7 @@ from physics3d.checks import Colour, Direction, Every, Length, Name, Pixels, Rat
 from physics3d.motion.clip import read_clip
 from physics3d.scenes.axes import Axes
 from physics3d.scenes.base import AbstractSource, Capture, Take
-from physics3d.scenes.clips import FilmedTake, clip_files, filmed_takes
+from physics3d.scenes.clips import FRAMES, FilmedTake, Pieces, clip_files, filmed_takes
 from physics3d.scenes.colmap import ColmapSource
 from physics3d.scenes.frames import VIDEOS
 from physics3d.scenes.lens import Lens, undistorted
@@ -43,7 +43,8 @@ class ThingSource(AbstractSource):
     name: Name
     path: Text  # the folder of photographs, or of one video around the thing, with the subfolder clips
     camera_distance: Length  # of the photographs from what they look at, in the middle [m]; sets the size of everything
-    fps: Rate | None = None  # of the clips [1/s]; None: what their files say
+    fps: Rate | None = None  # at which the clips were filmed [1/s]; None: what their files say
+    pieces: Pieces = field(default_factory=dict)  # of clips that are not used whole, by their names without endings [s]
     # taken from a video: the sharpest of each of so many stretches; photographs are used whole
     frames: Annotated[int, Ge(3), Le(100_000)] = 60
     longest_side: Annotated[Pixels, Ge(64)] = 1200  # photographs are reduced to this [px]
@@ -64,7 +65,7 @@ class ThingSource(AbstractSource):
         require_fields(self, "source")
         self.files()  # what is missing is said before clips are read
         around, clips = self._around(), clip_files(self._clips())
-        takes = filmed_takes(self._clips(), log=log, fps=self.fps)
+        takes = filmed_takes(self._clips(), log=log, fps=self.fps, pieces=self.pieces)
         with tempfile.TemporaryDirectory(prefix="physics3d_") as work:
             images = Path(work) / "images"
             (images / "photographs").mkdir(parents=True)
@@ -149,10 +150,17 @@ class ThingSource(AbstractSource):
 
         for number, (clip, take) in enumerate(zip(clips, takes)):
             first = min(take.rest, len(take.video) - 2)  # a piece of a clip has two frames or more
-            start, stop = max(0.0, (first - 0.5) / take.fps), (first + 1.5) / take.fps
-            piece = read_clip(clip, fps=take.fps, longest_side=self.longest_side, start=start, stop=stop).frames
+            two = read_clip(
+                clip,
+                fps=self.fps,
+                piece=self.pieces.get(clip.stem),
+                longest_side=self.longest_side,
+                most=FRAMES,
+                first=first,
+                count=2,
+            ).frames
             name = f"{number:03d}.png"
-            Image.fromarray(piece[min(take.rest - first, len(piece) - 1)].numpy()).save(target / name)
+            Image.fromarray(two[take.rest - first].numpy()).save(target / name)
             yield f"{target.name}/{name}", clip.name
 
 

@@ -12,7 +12,7 @@ from clips import FPS, decaying, encode, swaying
 from physics3d.log import Log
 from physics3d.motion.clip import read_clip
 from physics3d.motion.usable import check_clip
-from physics3d.scenes.clips import clip_files, filmed_takes
+from physics3d.scenes.clips import FRAMES, clip_files, filmed_takes
 from physics3d.video import ffmpeg
 
 SECONDS = 2.0
@@ -66,9 +66,77 @@ def test_a_variable_rate_is_made_constant_and_that_is_said(tmp_path, sway):
 
 def test_size_and_piece_are_chosen(tmp_path, sway):
     encode(sway, tmp_path / "clip.mp4")
-    clip = read_clip(tmp_path / "clip.mp4", longest_side=64, start=0.5, stop=1.5, fps=15)
-    assert clip.frames.shape == (15, 48, 64, 3) and clip.fps == 15
-    assert "reduced from 128 x 96 to 64 x 48 px" in clip.notes
+    clip = read_clip(tmp_path / "clip.mp4", longest_side=64)
+    assert clip.frames.shape == (60, 48, 64, 3) and "reduced from 128 x 96 to 64 x 48 px" in clip.notes
+    piece = read_clip(tmp_path / "clip.mp4", longest_side=64, first=15, count=30)
+    assert torch.equal(piece.frames, clip.frames[15:45])
+
+
+def test_a_piece_is_used_as_a_player_shows_its_times(tmp_path, sway):
+    encode(sway, tmp_path / "clip.mp4")
+    whole = read_clip(tmp_path / "clip.mp4")
+    for fps in (None, 240):  # slow motion is played slowly
+        used = read_clip(tmp_path / "clip.mp4", fps=fps, piece=(0.5, 1.5))
+        assert torch.equal(used.frames, whole.frames[15:45])
+        two = read_clip(tmp_path / "clip.mp4", fps=fps, piece=(0.5, 1.5), first=7, count=2)
+        assert torch.equal(two.frames, used.frames[7:9])
+    with pytest.raises(ValueError, match=r"0 frames from 2\.5 to 3 s; it lasts 1\.97 s"):
+        read_clip(tmp_path / "clip.mp4", piece=(2.5, 3.0))
+    black = torch.cat([0 * sway[:15], sway])  # begins in black: a cut, unless the piece leaves it out
+    encode(black, tmp_path / "black.mp4")
+    with pytest.raises(ValueError, match=r"a cut before frame 15 .*scene\.source\.pieces"):
+        filmed_takes(tmp_path / "black.mp4", log=Log(None))
+    (take,) = filmed_takes(tmp_path / "black.mp4", pieces={"black": (0.5, 9.0)}, log=Log(None))
+    assert len(take.video) == len(sway)
+    with pytest.raises(ValueError, match=r"source\.pieces names poke, which is none of the clips; take black"):
+        filmed_takes(tmp_path / "black.mp4", pieces={"poke": (0.5, 9.0)}, log=Log(None))
+
+
+def test_a_rate_that_is_given_is_that_of_the_camera(tmp_path, sway):
+    """Slow motion: every frame that was filmed is in the file, at another rate than it was filmed at."""
+    encode(sway, tmp_path / "slow.mp4")
+    told, given = read_clip(tmp_path / "slow.mp4"), read_clip(tmp_path / "slow.mp4", fps=240)
+    assert torch.equal(told.frames, given.frames) and given.fps == 240
+    assert "its file says 30 frames per second; filmed at 240" in given.notes[0]
+
+
+def test_of_a_fast_camera_fewer_frames_are_used_and_of_a_long_clip_the_first(tmp_path, sway):
+    for name, fps in (("fast.mp4", 120.0), ("long.mp4", 30.0)):
+        encode(sway, tmp_path / name, fps=fps)
+        whole, used = read_clip(tmp_path / name), read_clip(tmp_path / name, most=12)
+        every = 4 if fps > 30 else 1  # 12 of 60 would be every fifth: 24 in a second, less than 25
+        assert torch.equal(used.frames, whole.frames[::every][:12]) and used.fps == fps / every
+        said = " ".join(used.notes)
+        assert ("30 of its 120 frames per second are used" in said) == (every > 1) and "s are used, of" in said
+        piece = read_clip(tmp_path / name, most=12, first=10, count=5)
+        assert torch.equal(piece.frames, used.frames[10:])
+    assert read_clip(tmp_path / "long.mp4", most=60).notes == ()
+
+
+def test_pixels_are_square(tmp_path, sway):
+    encode(sway[:12], tmp_path / "wide.mp4", "-vf", "scale=64:96,setsar=2", "-c:v", "libx264", "-crf", "8")
+    clip = read_clip(tmp_path / "wide.mp4")
+    assert clip.frames.shape == (12, 96, 128, 3) and clip.size == (128, 96)
+    assert clip.notes == ("its pixels are 2:1, made square",)
+
+
+def test_a_frame_is_of_one_instant(tmp_path):
+    """Interlaced: the odd lines of every frame are those of the next instant."""
+    moved = swaying(decaying(np.arange(40) / (2 * FPS), frequency=4.0, amplitude=12.0))
+    combed = moved[::2].clone()
+    combed[:, 1::2] = moved[1::2, 1::2]
+    words = ("-vf", "setfield=tff", "-c:v", "libx264", "-crf", "8", "-flags", "+ilme+ildct")
+    encode(combed, tmp_path / "combed.mp4", *words)
+    clip = read_clip(tmp_path / "combed.mp4")
+    away = lambda video: (video.float() - moved[::2].float()).square().mean()
+    assert len(clip.frames) == len(combed) and "interlaced" in clip.notes[0]
+    assert away(clip.frames) < 0.3 * away(combed)
+
+
+def test_transparency_is_left_out_and_that_is_said(tmp_path, sway):
+    encode(sway[:12], tmp_path / "cut_out.mov", "-vf", "format=argb", "-c:v", "qtrle")
+    clip = read_clip(tmp_path / "cut_out.mov")
+    assert torch.equal(clip.frames, sway[:12]) and "transparency" in clip.notes[0]
 
 
 def test_what_is_no_clip_is_refused_in_one_line(tmp_path, sway):
@@ -77,17 +145,21 @@ def test_what_is_no_clip_is_refused_in_one_line(tmp_path, sway):
     subprocess.run([ffmpeg(), "-v", "error", *sound], check=True)
     encode(sway[:1], tmp_path / "one.mp4")
     encode(sway[:12], tmp_path / "bare.h264", "-c:v", "libx264", "-f", "h264")
+    encode(sway[:12], tmp_path / "bare.mjpeg", "-c:v", "mjpeg", "-f", "mjpeg")
     for name, message in (
         ("none.mp4", "no clip at"),
         ("text.mp4", "cannot read the clip text.mp4"),
         ("sound.m4a", "no video in it"),
         ("one.mp4", "1 frame"),
         ("bare.h264", "rate is unknown"),
+        ("bare.mjpeg", "rate is unknown"),
     ):
         with pytest.raises(ValueError, match=message) as error:
             read_clip(tmp_path / name)
         assert "\n" not in str(error.value)
-    assert len(read_clip(tmp_path / "bare.h264", fps=30).frames) == 12
+    for name in ("bare.h264", "bare.mjpeg"):  # whatever rate ffmpeg would think of
+        clip = read_clip(tmp_path / name, fps=50)
+        assert len(clip.frames) == 12 and clip.fps == 50
 
 
 @pytest.mark.parametrize("name", ["a:b.mp4", "-y.mp4", "p%04d (1).mp4", "concat:x|y.mp4"])
@@ -202,6 +274,38 @@ def test_every_kind_of_a_fault_is_found(tmp_path, kind):
         judged(tmp_path, make())
 
 
+def wind(rng):
+    """What gusts make of a swing of 2 Hz."""
+    place, speed, path = 0.0, 0.0, []
+    for _ in T:
+        for _ in range(10):
+            speed += (-((4 * np.pi) ** 2) * place - 1.6 * speed + 1500 * rng.normal()) / (10 * FPS)
+            place += speed / (10 * FPS)
+        path.append(place)
+    return 6 * np.array(path) / np.abs(path).max()
+
+
+DRIVEN = {  # motions that are no free decay, each with what is said of it
+    "a hand": (lambda rng: 5 * np.sin(9 * T + 2 * np.sin(4.1 * T)), "does not follow from its first"),
+    "wind": (wind, "does not follow from its first"),
+    "another push": (lambda rng: SWAY + np.where(T > 1.3, 5 * np.sin(14 * (T - 1.3)), 0), "does not follow"),
+    "a motor": (lambda rng: 5 * np.sin(2 * np.pi * 2 * T), "hardly dies out"),
+}
+
+
+@pytest.mark.parametrize("cause", DRIVEN)
+def test_what_is_not_left_alone_is_doubted(tmp_path, cause, rng):
+    make, message = DRIVEN[cause]
+    (doubt,) = judged(tmp_path, swaying(make(rng))).doubts
+    assert message in doubt and "\n" not in doubt
+
+
+def test_a_free_decay_is_not_doubted(tmp_path, sway):
+    assert judged(tmp_path, sway).doubts == ()
+    slow = swaying(decaying(np.arange(90) / FPS, frequency=1.0, damping=0.1, amplitude=6.0))
+    assert judged(tmp_path, slow).doubts == ()
+
+
 def test_light_that_changes_is_no_fault(tmp_path):
     """A lamp at 3 Hz, 5 %; a cloud, 20 % in the end."""
     for light in (1 + 0.05 * np.sin(2 * np.pi * 3 * T), 1 - 0.1 * T):
@@ -223,6 +327,14 @@ def test_takes_of_a_folder_are_one_to_learn_and_others_to_predict(tmp_path, sway
         takes[0].seen_by(dataclasses.replace(camera, width=64))
     with pytest.raises(ValueError, match="no clip"):
         filmed_takes(tmp_path / "empty", log=Log(None))
+
+
+def test_a_take_has_no_more_frames_than_memory_and_minutes_allow(tmp_path):
+    shift = decaying(np.arange(2 * FRAMES) / 60, damping=0.4, amplitude=3.0)
+    encode(swaying(shift, h=48, w=64), tmp_path / "fast.mp4", fps=60)
+    (take,) = filmed_takes(tmp_path / "fast.mp4", log=Log(None))
+    assert len(take.video) == FRAMES and take.fps == 30
+    assert take.decay.frequency[take.decay.main()] == pytest.approx(2.0, rel=0.03)
 
 
 def test_clips_of_a_folder_are_files_that_fit_and_have_names_of_their_own(tmp_path):

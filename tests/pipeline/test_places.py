@@ -25,7 +25,7 @@ NEW = {  # what refuses a place where something is; each with the ending of what
     "film": (on(film, SCENE), ".mp4"),
     "still": (on(still, SCENE), ".png"),
     "report": (on(web, SCENE), ".html"),
-    "twin": (lambda out: twin.main({"OUT": out}), ""),
+    "twin": (on(twin), ""),
 }
 FILLED = {  # what fills a folder, which may be there
     "score": lambda out: score.main({**CLIPS, "OUT": out}),

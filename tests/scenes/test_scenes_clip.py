@@ -43,8 +43,9 @@ def test_a_clip_alone_tells_how_the_thing_swings_next(tmp_path):
     body = Fill(spacing=0.012)(capture, capture.gaussians, None, log=Log(None))
     assert bool(body.attached.any()) and float(body.position[body.attached, 2].max()) < 0
     learn = Learn(world=world, prior=None, learn=("youngs_modulus",), zones=1)
-    estimate = learn(capture, capture.gaussians, body, log=Log(None))
+    estimate = learn(capture, capture.gaussians, body, log=Log(tmp_path / "learn", quiet=True))
     estimate.check()
+    assert "assumed: its density is 500 kg/m^3" in (tmp_path / "learn" / "log.txt").read_text()
     # a clamped rod of this length and thickness, as assumed: f = 1.875^2/(2 pi L^2) sqrt(E I/(rho A)), I/A = r^2/4
     camera = take.cameras[0]
     pixel = 0.5 / camera.fx
