@@ -65,7 +65,7 @@ class Beyond:
     takes more where the thinnest held section (`filling/section.py`) has fewer cells: 28 % for one.
     modes: the same where a body is moved without a grid (`docs/results/swaying.md`). The twin's poke is within 1 % of
     that by finite elements, beams and forks within 1 to 2.5 % in frequency, twice that in E. Learning takes more where
-    splines further apart say so (`Solver.too_stiff`): 8 % for the brim of the hat.
+    splines further apart say so (`Model.too_stiff`): 6 % for the brim of the hat.
     """
 
     surface: Width = 0.1

@@ -37,9 +37,9 @@ QUADRATURE = 300  # points of integration, besides those that the modes ask for
 SMOOTH = 30.0  # times the highest mode: what would swing faster is smoothed out of a start
 RIGID = 1e-3  # of the highest mode: what swings slower is a rigid motion, if nothing holds the body
 MOST_GROUPS = 8  # materials that differ; more are a field
-# two resolutions: splines so many times as far apart, so many modes of theirs, and the least power of their distance by
-# which a stiffness is wrong (the brim of the hat has one of 3)
-APART = 1.5
+# two resolutions: splines so many times as far apart, so many modes of theirs, and the power of their distance by which
+# a stiffness is wrong at least (2.2 for the brim of the hat, 4 and more for the cord, which shows from 1.5 on)
+APART = 1.25
 LOOKED_AT = 4
 ORDER = 2
 

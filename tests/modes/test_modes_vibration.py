@@ -46,10 +46,10 @@ def test_a_turned_free_beam_swings_as_in_theory(shape, degrees):
     np.testing.assert_allclose(found, np.repeat(theory, 2), rtol=0.02)
 
 
-@pytest.mark.parametrize("cell", [4.0, 8.0, 10.0])
+@pytest.mark.parametrize("cell", [4.0, 6.0, 8.0])
 def test_splines_far_apart_say_how_much_too_stiff_they_are(cell):
-    """Against the theory of a short free beam, in the mean over its first four modes: 1, 3 and 4 %; 2 % for the sampled
-    surface besides."""
+    """Against the theory of a short free beam, in the mean over its first four modes: 0.5, 1.5 and 3 %; 2 % for the
+    sampled surface besides."""
     thick, slender, young = 0.012, 10, 1e5
     position, volume, matter = turned_beam(slender * thick, thick, "square", 30, spacing=0.006, shift=0.37)
     of = world(young, 0.3, boundaries=())
