@@ -2,13 +2,14 @@
 
 Of the take that was learned from the second half is foretold, of the others all that follows their first half second
 from the release on, in which only their start is sought. The prediction is by the modes of the body as the first take
-shows them (`learning/identify.py`); beside it stand still pictures, the image modes of what was seen, what was seen
-played again, which no motion that is fitted to it without physics can better, and the motion of the learned material
-alone, and of the material before it was learned, in modes that nothing has corrected.
+shows them (`learning/identify.py`), and of the first take also by what a quarter and a half of what was seen of it
+tell, so that one sees what a longer clip is worth; beside it stand still pictures, the image modes of what was seen,
+what was seen played again, which no motion that is fitted to it without physics can better, and the motion of the
+learned material alone, and of the material before it was learned, in modes that nothing has corrected.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -22,7 +23,16 @@ from physics3d.learning.foretold import Moving, foretold, has_stopped
 from physics3d.learning.free_body import material_of
 from physics3d.learning.free_motion import Material, start
 from physics3d.learning.identify import Swing
-from physics3d.learning.unknown_cause import Swung, by_its_own_camera, first_take, frames_seen, other_take, swung
+from physics3d.learning.unknown_cause import (
+    LEAST,
+    Seen,
+    Swung,
+    by_its_own_camera,
+    first_take,
+    frames_seen,
+    other_take,
+    swung,
+)
 from physics3d.log import Log
 from physics3d.metrics.against import Lines, Reference
 from physics3d.metrics.scores import REFERENCE, Scores
@@ -35,6 +45,7 @@ from physics3d.world import Estimate, World
 
 SEEN, LEARNED, START, IMAGE = "modes as seen", "learned material", "material before", "image modes"
 AGAIN = "what was seen, again"
+SHORTER = (0.25, 0.5)  # of what is seen of the first take from the release on
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +76,8 @@ class Foretell:
         pose = {name: None if reference is None else motion.at(reference) for name, motion in motions.items()}
         if has_stopped(ready.sight, swing, first.flow, first.weight, fps=take.fps, release=release):
             motions[SEEN] = _stopped(swing, take, notes, log)
-        scores |= self.judged(ready, take, motions, first.flow, release=release, seen=seen, notes=notes, log=log)
+        less = self.shorter(ready, release, log)
+        scores |= self.judged(ready, take, motions, first.flow, less, release=release, seen=seen, notes=notes, log=log)
         for other in capture.takes:
             if other is not take:
                 own = ready if other.posed is None else by_its_own_camera(ready, capture, other, gaussians, body, log)
@@ -104,7 +116,22 @@ class Foretell:
         motions: dict[str, Moving] = {SEEN: swing}
         for name, material in materials.items():
             motions[name] = start(ready.reduced, material, told.window, known=known[name], large=swing.large)[0]
-        return self.judged(ready, take, motions, told.flow, release=release, seen=seen, notes=notes, log=log)
+        return self.judged(ready, take, motions, told.flow, [], release=release, seen=seen, notes=notes, log=log)
+
+    def shorter(self, ready: Swung, release: int, log: Log) -> list[Seen]:
+        """What shares of the frames seen of the first take tell, those that tell of a swing."""
+        found: list[Seen] = []
+        for share in log.progress(list(SHORTER), "looking at less of the clip"):
+            count = release + round(share * (frames_seen(ready.take) - release))
+            told = f"the first {(count - release) / ready.take.fps:.2g} s of the motion"
+            if count - release < LEAST:
+                log.info(f"{told} are {count - release} frames: too few to foretell by")
+                continue
+            try:
+                found.append(first_take(replace(ready, take=replace(ready.take, seen=count)), log.hushed()))
+            except ValueError as why:
+                log.info(f"{told} do not foretell it: {why}")
+        return found
 
     def judged(
         self,
@@ -112,13 +139,15 @@ class Foretell:
         take: Take,
         motions: dict[str, Moving],
         flow: np.ndarray,
+        less: list[Seen],
         *,
         release: int,
         seen: int,
         notes: dict[str, str],
         log: Log,
     ) -> dict[str, dict[str, float | None]]:
-        """Measures and the page of what follows frame `seen` - 1; `flow` of the frames up to it."""
+        """Measures and the page of what follows frame `seen` - 1; `flow` of the frames up to it. `less`: what shorter
+        looks tell of the same frames."""
         frames, fps = take.videos[0], take.fps
         future = frames[seen:]
         times = (np.arange(release, len(frames)) - release) / fps
@@ -132,6 +161,22 @@ class Foretell:
         clips[IMAGE] = image_modes(frames[:seen], fps).frames(range(seen, len(frames)))
         clips[AGAIN] = frames[release + np.arange(len(future)) % (seen - release)]
         clips |= stills(frames, seen=seen)
+        length = {SEEN: {len(at) / fps: SEEN}, IMAGE: {len(at) / fps: IMAGE}}  # s that were seen -> what it foretells
+        for look in less:
+            count, after = len(look.flow), (np.arange(len(frames)) - look.release) / fps
+            few, seconds = frames[look.release : count], (count - release) / fps
+            mine = foretold(
+                few,
+                ready.sight,
+                look.swing,
+                look.flow[look.release :],
+                at=after[look.release : count],
+                times=after[seen:],
+            )
+            images = image_modes(frames[:count], fps).frames(range(seen, len(frames)))
+            for name, clip in ((SEEN, mine), (IMAGE, images)):
+                length[name][seconds] = f"{name}, of {seconds:.2g} s"
+                clips[length[name][seconds]] = clip
         measured = Reference(future, fps, thing=moved(ready.sight.thing, flow[-1]))
         found = {REFERENCE: _plain(measured.itself()[0], take.name, notes)}
         lines: dict[str, Lines] = {}
@@ -141,7 +186,17 @@ class Foretell:
         said = [_swings(swing)] + [
             f"{about}: {why}" for about, why in notes.items() if about.startswith(f"{take.name}: ")
         ]
-        take_page(take.name, frames, fps, clips, found, lines, seen=seen, said=said, best=SEEN, bar=IMAGE, log=log)
+        by_length: dict[str, dict[float, float]] = {
+            name: {seconds: found[row]["psnr"] for seconds, row in sorted(rows.items())}
+            for name, rows in length.items()
+            if less
+        }
+        of_less = {row for rows in length.values() for row in rows.values()} - length.keys()
+        lines = {name: line for name, line in lines.items() if name not in of_less}  # few enough to tell apart
+        take_page(
+            take.name, frames, fps, clips, found, lines,
+            by_length=by_length, seen=seen, said=said, best=SEEN, bar=IMAGE, log=log,
+        )  # fmt: skip
         return {f"{take.name}: {name}": cells for name, cells in found.items()}
 
 

@@ -46,3 +46,16 @@ def curves(values: dict[str, dict[str, list[float]]], fps: float, *, first: int)
         axis.set(xlabel="time [s]", title=measure)
         axis.legend(frameon=False, fontsize=8)
     return figure
+
+
+def against_length(values: dict[str, dict[float, float]]):
+    """Figure: PSNR [dB] of every prediction against the seconds of motion that it is made of."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(5.5, 3.2), layout="constrained")
+    axis = figure.add_subplot()
+    for name, points in values.items():
+        axis.plot(list(points), list(points.values()), "o-", lw=1.2, label=name)
+    axis.set(xlabel="of the motion that was seen [s]", ylabel="PSNR of what follows [dB]")
+    axis.legend(frameon=False, fontsize=8)
+    return figure

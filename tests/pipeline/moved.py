@@ -121,7 +121,7 @@ class Predict:
             lines = {name: {"PSNR [dB]": each.psnr_per_frame, "SSIM": each.ssim} for name, each in like.items()}
             take_page(
                 take.name, video, take.fps, clips, rows, lines,
-                seen=seen, said=["it swings"], best="modes as seen", bar="image modes", log=log,
+                by_length={}, seen=seen, said=["it swings"], best="modes as seen", bar="image modes", log=log,
             )  # fmt: skip
             values |= {f"{take.name}: {name}": row for name, row in rows.items()}
         return Scores(values=values, notes={f"{capture.takes[0].name}: frequency": "nothing swings"})

@@ -65,6 +65,10 @@ def test_a_clip_alone_tells_how_the_thing_swings_next(tmp_path):
     assert mine["damping"] == pytest.approx(DAMPING, rel=0.3)
     assert reference["frequency"] == pytest.approx(FREQUENCY, rel=0.01)
     assert scores[f"rod: {IMAGE}"]["psnr"] > still["psnr"]
+    # two and a half and five of the ten periods that are seen tell of the same frames; a steady swing needs no more
+    less = {row: cells["psnr"] for row, cells in scores.items() if row.startswith(f"rod: {SEEN}, of ")}
+    assert len(less) == 2 and min(less.values()) > still["psnr"] + 3
+    assert max(scores[row.replace(SEEN, IMAGE)]["psnr"] for row in less) < mine["psnr"]
     # a release that is said to be late leaves one and a half periods to be learned from
     late = replace(capture, takes=(replace(take, release=37),))
     release = first_take(swung(world, late, capture.gaussians, body, zones=1, log=Log(None)), Log(None)).release
