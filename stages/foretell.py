@@ -187,7 +187,7 @@ class Foretell:
             f"{about}: {why}" for about, why in notes.items() if about.startswith(f"{take.name}: ")
         ]
         by_length: dict[str, dict[float, float]] = {
-            name: {seconds: found[row]["psnr"] for seconds, row in sorted(rows.items())}
+            name: {seconds: float(found[row]["psnr"] or math.nan) for seconds, row in sorted(rows.items())}
             for name, rows in length.items()
             if less
         }
