@@ -6,9 +6,7 @@ apart.
 
 with a_z, b_z random states of the basis in coordinates in which its stiffness is the identity: all of them have the
 same energy, so that bending is integrated as well as stretching, which is a thousand times stiffer. A set of factors
-that integrates enough random products integrates all. So it does for small strain; in a wide swing stretches cancel
-that by themselves are large, and the work of some such swings is among the products (`wide.py`). Factors that are not
-negative keep every energy an energy.
+that integrates enough random products integrates all. Factors that are not negative keep every energy an energy.
 Non-negative least squares leaves at most as many points as there are products. An, Kim and James (2008), Farhat et al.
 (2014).
 """
@@ -27,17 +25,17 @@ def chosen(
     tangent: Float[np.ndarray, "9 n 3 3"],
     K: Float[np.ndarray, "u u"],
     modes: Float[np.ndarray, "u m"],
-    works: Float[np.ndarray, "n w"],
     group: Int[np.ndarray, " n"],
     count: int,
     seed: int = 0,
 ) -> tuple[Int[np.ndarray, " c"], Float[np.ndarray, " c"]]:
-    """(which of n points, the factors of their weights), at most about `count` and as many as there are `works`; K is
-    the stiffness with all points, `modes` of vibration, whose products are integrated with more weight than random
-    ones, `works` at the points those of wide swings, in units in which states have the energy of a half. Points of
-    different `group`, of other materials, are integrated each by their own."""
+    """(which of n points, the factors of their weights), at most about `count`; K is the stiffness with all points,
+    `modes` of vibration, whose products are integrated with more weight than random ones.
+    Points of different `group`, of other materials, are integrated each by their own."""
     rng = np.random.default_rng(seed)
     n, r = len(group), gradient.shape[1]
+    if n <= 1.5 * count:
+        return np.arange(n), np.ones(n)
     value, vector = linalg.eigh((K + K.T) / 2)
     root = vector / np.sqrt(np.maximum(value, 1e-10 * value.max()))  # states of unit energy [3r, 3r]
     pairs = np.stack(np.triu_indices(modes.shape[1]), 1)
@@ -47,8 +45,7 @@ def chosen(
     for label, own_count in zip(labels, size, strict=True):
         own = np.flatnonzero(group == label)
         rows = max(100, round(count * own_count / n)) + len(pairs)
-        wide = works[own, : max(50, round(works.shape[1] * own_count / n))]
-        if len(own) <= rows + wide.shape[1]:
+        if len(own) <= rows:
             found.append(own)
             factors.append(np.ones(len(own)))
             continue
@@ -63,19 +60,13 @@ def chosen(
             Ha, Hb = ((slopes[at] @ s).reshape(len(at), 3, 3, rows) for s in (a, b))
             P = np.einsum("ainbk,nbkz->naiz", D[:, :, at], Hb, optimize=True)
             Y[begin : begin + 512] = np.einsum("naiz,naiz->nz", Ha, P)
-        scale = 1 / np.sqrt((Y**2).sum(0) * len(own))
-        # of works that cancel, nothing but their rounding would be left if each were scaled by its own
-        scale = np.concatenate([scale, np.full(wide.shape[1], np.median(scale[len(pairs) :]))])
-        scale[: len(pairs)] *= WEIGHT
-        Y = np.concatenate([Y, wide], 1)
         target = Y.sum(0)
+        scale = 1 / np.sqrt((Y**2).sum(0) * len(own))
+        scale[: len(pairs)] *= WEIGHT
         # candidates by the energy they hold: what bends at a narrow foot bends nowhere else
         share = np.linalg.norm(Y * scale, axis=1)
         take = rng.choice(
-            len(own),
-            min(CANDIDATES * Y.shape[1], len(own)),
-            replace=False,
-            p=(share + share.mean()) / (2 * share.sum()),
+            len(own), min(CANDIDATES * rows, len(own)), replace=False, p=(share + share.mean()) / (2 * share.sum())
         )
         solution = _not_negative((Y[take] * scale).T, target * scale)
         kept = solution > 0

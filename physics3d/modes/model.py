@@ -33,10 +33,7 @@ MOST_SPLINES = 2500
 BLOCK = 2.5  # edges of a piece: of splines that far apart, what hangs together in the half of it is integrated as one
 PIN = 1e3  # stiffness of a pin, in that of a cube of the piece behind it
 MODES = 12  # of vibration, whose components are fields of the basis
-# points of integration, besides those that the modes ask for; where a body swings widely, two thirds of them for small
-# strain and as many for wide swings: the twin's poke is then within 0.2 to 0.4 % of that of all points, whatever the
-# seed, and within 0.4 to 1.6 % if there are 300 in all
-QUADRATURE = 300
+QUADRATURE = 300  # points of integration
 SMOOTH = 30.0  # times the highest mode: what would swing faster is smoothed out of a start
 RIGID = 1e-3  # of the highest mode: what swings slower is a rigid motion, if nothing holds the body
 MOST_GROUPS = 8  # materials that differ; more are a field
@@ -253,8 +250,8 @@ def model(
     def in_basis(matrix: sparse.spmatrix) -> np.ndarray:
         return np.kron(C.T @ (matrix @ C), np.eye(3))
 
-    if swings_widely and swings.any():
-        seen = wide.swings(G, weight, shapes[:, swings], exact[swings])
+    seen = wide.swings(N, G, weight, shapes[:, swings], exact[swings])
+    if swings_widely and seen.modes.size:
         forces = wide.second_order(G, stuck, seen.modes)
         forces -= M @ (rigid @ (rigid.T @ forces))
         answers = -_relieved((K + _three(rest) + shift * M).tocsr(), forces, M, rigid)
@@ -269,30 +266,16 @@ def model(
     mass = C.T @ (scalar_mass @ C)
     K = vibration.stiffness(slopes_there, tangent)
     group = _groups(coefficients)
-    if group.max() + 1 > MOST_GROUPS or len(weight) <= 1.5 * points_:  # a field of parameters: every particle counts
+    if group.max() + 1 > MOST_GROUPS:  # a field of parameters: every particle counts
         which, factor = np.arange(len(weight)), np.ones(len(weight))
     else:
         whole = K + in_basis(rest)
-        square, own_modes = vibration.dense_modes(whole, np.kron(mass, np.eye(3)), len(exact), shift=shift)
-        of_works = 2 * points_ // 3 if swings_widely and swings.any() else 0
-
-        def works() -> np.ndarray:
-            seen = wide.swings(slopes_there, weight, own_modes[:, swings], square[swings])
-            return wide.works(slopes_there, stuck, seen, whole + shift * np.kron(mass, np.eye(3)), of_works)
-
+        _, own_modes = vibration.dense_modes(whole, np.kron(mass, np.eye(3)), modes, shift=shift)
         which, factor = journal.ask(
             "points of integration",
             whole,
             points_,
-            answer=lambda: cubature.chosen(
-                slopes_there,
-                tangent,
-                whole,
-                own_modes[:, :modes],
-                works() if of_works else np.zeros((len(weight), 0)),
-                group,
-                of_works or points_,
-            ),
+            answer=lambda: cubature.chosen(slopes_there, tangent, whole, own_modes, group, points_),
         )
     slopes_there = np.ascontiguousarray(slopes_there.reshape(len(weight), 3, -1)[which].reshape(3 * len(which), -1))
     K = vibration.stiffness(slopes_there, tangent[:, which] * factor[:, None, None])

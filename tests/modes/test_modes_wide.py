@@ -10,8 +10,7 @@ from modes_bodies import row, world
 from physics3d.filling.cells import solid_cells
 from physics3d.log import Log
 from physics3d.matter import Matter
-from physics3d.modes import vibration, wide
-from physics3d.modes.model import Model
+from physics3d.modes import wide
 from physics3d.modes.rollout import Solver
 from physics3d.modes.stress import Points
 from physics3d.scenes.made import MadeTwin
@@ -57,10 +56,6 @@ def points_of(solver: Solver) -> Points:
     return Points(solver.world.material, coefficients, solver.model.weight)
 
 
-def swings_of(model: Model) -> wide.Swings:
-    return wide.swings(model.gradient, model.weight, model.shapes.reshape(len(model.omega), -1).T, model.omega**2)
-
-
 def test_a_beam_that_bends_shortens_as_one_that_cannot_stretch():
     """u_x'' = d^2/dq^2 of -q^2/2 int w'^2 dx of a beam whose length stays: psi_x(x) = -int_0^x w'^2 dx. A slender beam
     stretches by (thickness/length)^2 of that at most."""
@@ -76,34 +71,6 @@ def test_a_beam_that_bends_shortens_as_one_that_cannot_stretch():
     expected = -np.concatenate([[0.0], np.cumsum((slope**2).sum(1))[:-1]]) * edge - (slope**2).sum(1) * edge / 2
     found = (model.values @ psi)[:, 0]
     assert np.abs(found - expected).max() < 0.03 * np.abs(expected).max(), (x[-1], found[-1], expected[-1])
-
-
-def test_the_force_of_a_wide_swing_is_that_of_all_points_of_integration():
-    """In every state of the basis of unit energy, half a per cent of a force that is 26 in these units: of points that
-    were chosen for small strain alone it was 0.8 %."""
-    few, every = plucked(300), plucked(10**6)
-    assert len(few.model.weight) < len(every.model.weight) / 20
-    chosen, all_of_them, body = points_of(few), points_of(every), every.model
-    seen = swings_of(body)
-    psi = -np.linalg.solve(body.stiffness, wide.second_order(body.gradient, all_of_them, seen.modes))
-    value, vector = np.linalg.eigh(body.stiffness)
-    root = vector / np.sqrt(value)
-    rng = np.random.default_rng(5)
-    k = seen.modes.shape[1]
-    i, j = np.triu_indices(k)
-
-    def force(gradient: np.ndarray, points: Points, pose: np.ndarray) -> np.ndarray:
-        P = points.stress((gradient @ pose.reshape(-1, 3)).reshape(-1, 3, 3), vibration.STUCK)
-        return root.T @ (gradient.T @ P.reshape(-1, 3)).reshape(-1)
-
-    off, whole = [], []
-    for _ in range(20):
-        q = rng.standard_normal(k)
-        q /= np.linalg.norm(q)
-        pose = seen.modes @ q + psi @ (q[i] * q[j] / (1 + (i == j)))
-        whole.append(force(body.gradient, all_of_them, pose))
-        off.append(force(few.model.gradient, chosen, pose) - whole[-1])
-    assert np.square(off).sum() < 0.005**2 * np.square(whole).sum()
 
 
 def test_a_coil_that_is_plucked_far_swings_as_finite_elements_say():
