@@ -49,7 +49,7 @@ def free_posterior(
     log: Log,
 ) -> Posterior:
     """Of theta - what was likely. `flow` [px] and its `weight` at the pixels of the sight, in the frames of `clip`.
-    `large`: as the clip tells it, or SMALL, which is known."""
+    `large`: as the clip tells it, or SMALL, which is known. `beyond`: for a body without a grid (`Beyond.of`)."""
     zones = len(material.zones) if np.ptp(material.zones) > 0 else 0
     law = [] if large is SMALL else [large.slower, large.sooner]
     theta = np.concatenate([[material.stiffness, material.ratio, material.time], material.zones[:zones], law])

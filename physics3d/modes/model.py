@@ -230,7 +230,9 @@ def model(
     fields = [shapes[:, swings]]
     sources = [*load_fields] + ([first_moment] if any(world.gravity) else [])
     rigid = shapes[:, ~swings]
-    responses = _responses((K + _three(rest) + shift * M).tocsr(), sources, M, rigid)
+    regular = (K + _three(rest) + shift * M).tocsr()
+    factored = functools.cache(lambda: vibration.Factor(regular))
+    responses = _responses(factored, sources, M, rigid)
     if responses.size:
         fields.append(responses)
     if found.grips:
@@ -238,7 +240,10 @@ def model(
         everything = (K + _three(gripped)).tocsr()
         _, more = modes_of(everything, modes)
         pulls = [s.pull.first[:, k] for s in springs if s.pull is not None for k in range(4)]
-        fields += [more, _responses((everything + shift * M).tocsr(), [*sources, *pulls], M, rigid[:, :0])]
+        fields += [
+            more,
+            _responses(lambda: vibration.Factor((everything + shift * M).tocsr()), [*sources, *pulls], M, rigid[:, :0]),
+        ]
     scalars = basis.turned(np.concatenate(fields, 1), G, weight)
     if not held:
         affine = (splines.affine() - [0, *at.mean(0)]) * [span, 1, 1, 1] / np.sqrt(weight.sum())
@@ -254,7 +259,7 @@ def model(
     if swings_widely and seen.modes.size:
         forces = wide.second_order(G, stuck, seen.modes)
         forces -= M @ (rigid @ (rigid.T @ forces))
-        answers = -_relieved((K + _three(rest) + shift * M).tocsr(), forces, M, rigid)
+        answers = -_answers(factored(), forces, M, rigid)
         whole = vibration.stiffness(G @ C, tangent) + in_basis(rest + shift * scalar_mass)
         of_basis = (C.T @ forces.reshape(splines.count, -1)).reshape(len(whole), -1)
         held_by_basis = of_basis.T @ np.linalg.solve(whole, of_basis)
@@ -334,22 +339,25 @@ def _shift(world: World, modulus: np.ndarray, span: float, held: bool) -> float:
     return (1e-6 if held else 1e-4) * float(np.median(modulus)) / (world.density * span**2)
 
 
-def _responses(K: sparse.csr_matrix, sources: list[np.ndarray], M: sparse.csr_matrix, rigid: np.ndarray) -> np.ndarray:
+def _responses(
+    factored: Callable[[], vibration.Factor], sources: list[np.ndarray], M: sparse.csr_matrix, rigid: np.ndarray
+) -> np.ndarray:
     """Static responses [3 f, k] to each scalar source along each axis, relative to the `rigid` motions [3 f, n] of a
-    free body, M-orthonormal: under a force it accelerates, and bends by what the force differs from its inertia."""
+    free body, M-orthonormal: under a force it accelerates, and bends by what the force differs from its inertia.
+    `factored` gives the stiffness, factored."""
     if not sources:
-        return np.zeros((K.shape[0], 0))
+        return np.zeros((M.shape[0], 0))
     columns = np.concatenate([np.kron(s[:, None], np.eye(3)[:, [i]]) for s in sources for i in range(3)], 1)
     relieved = columns - M @ (rigid @ (rigid.T @ columns))
     bends = np.abs(relieved).max(0) > 1e-6 * np.abs(columns).max(0)
     if not bends.any():
-        return np.zeros((K.shape[0], 0))
-    return _relieved(K, relieved[:, bends], M, rigid)
+        return np.zeros((M.shape[0], 0))
+    return _answers(factored(), relieved[:, bends], M, rigid)
 
 
-def _relieved(K: sparse.csr_matrix, forces: np.ndarray, M: sparse.csr_matrix, rigid: np.ndarray) -> np.ndarray:
-    """K^-1 forces, without rigid motions."""
-    found = vibration.Factor(K)(forces)
+def _answers(factor: vibration.Factor, relieved: np.ndarray, M: sparse.csr_matrix, rigid: np.ndarray) -> np.ndarray:
+    """Static responses [3 f, k] to forces [3 f, k] without their rigid part, without rigid motions."""
+    found = factor(relieved)
     return found - rigid @ (rigid.T @ (M @ found))
 
 

@@ -32,7 +32,7 @@ MOST = 10  # fields that are added
 class Swings:
     """Modes of vibration at an amplitude at which all have one energy."""
 
-    modes: np.ndarray  # [u, k]
+    modes: np.ndarray  # [u, k], row 3 j + i: component i of function j [m]
     energy: float  # [J]
 
 
@@ -43,8 +43,8 @@ def swings(
     shapes: Float[np.ndarray, "u m"],
     square: Float[np.ndarray, " m"],
 ) -> Swings:
-    """The first of `shapes`, modes of vibration of unit mass without rigid ones, in which some of the body takes part,
-    and their omega^2 `square` [1/s^2]; `values` and `gradient` of the functions at the points of `weight`."""
+    """The first of `shapes`, modes of vibration of unit mass without rigid ones, in which PART of the body takes part.
+    `square`: their omega^2 [1/s^2]; `values` and `gradient` [1/m] of the functions at the points of `weight` [m^3]."""
     fields = shapes.reshape(values.shape[1], -1)
     there = ((values @ fields).reshape(len(weight), 3, -1) ** 2).sum(1)
     part = (weight @ there) ** 2 / (weight.sum() * np.maximum(weight @ there**2, 1e-300))
@@ -52,7 +52,8 @@ def swings(
     modes = shapes[:, which] / np.sqrt(square[which])
     slopes = (gradient @ modes.reshape(values.shape[1], -1)).reshape(len(weight), 9, len(which))
     largest = float(np.linalg.norm(slopes, axis=1).max(initial=0.0))
-    return Swings(modes=WIDE / max(largest, 1e-300) * modes, energy=(WIDE / max(largest, 1e-300)) ** 2 / 2)
+    amplitude = WIDE / max(largest, 1e-300)  # times 1/omega: that of a mode [m kg^(1/2)]
+    return Swings(modes=amplitude * modes, energy=amplitude**2 / 2)
 
 
 def second_order(
