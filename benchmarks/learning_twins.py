@@ -12,6 +12,9 @@ so that every clip shows about as many swings. All but the cake move as finite e
 (`reference_motion.py`): their shape, q and r are those of the scene, and s is a change of units, in which that motion
 stays exact. What no such motion is kept of is moved by the modes, of particles of the solids themselves, at 0.8 of the
 spacing of those that filling puts into the Gaussians.
+
+Where all that is assumed is told wrongly, the learner's lengths are e^N(0, 0.05) and its forces e^N(0, 0.1) times the
+true ones: what it sees is the same, and E goes with force/length^2, the density with force/length^4.
 """
 
 import math
@@ -44,6 +47,7 @@ from physics3d.solver import motion_of
 from physics3d.world import World
 
 DENSITY = 0.1  # deviation of the logarithm of the density as given
+LENGTH, FORCE = 0.05, 0.1  # and of size and push, where they are told wrongly
 NOISE = 2.0 / 255  # deviation of a pixel
 SIDE = (80, 60)  # of the pictures [px]
 SHOTS, RINGS = 24, (-12.0, 14.0, 44.0)  # photographs, on rings so high above the horizon [deg]
@@ -268,6 +272,30 @@ def filmed(
             pictures.append((255 * np.clip(noisy, 0, 1) + 0.5).astype(np.uint8))
         films.append(torch.from_numpy(np.stack(pictures)))
     return tuple(films)
+
+
+def told_wrongly(twin: Twin, *, cameras: int, seed: int) -> Twin:
+    """The same body and films for a learner whose ruler and whose spring balance are off."""
+    rng = np.random.default_rng((seed, cameras, zlib.crc32(twin.capture.name.encode()), 1))
+    longer, stronger = math.exp(LENGTH * rng.normal()), math.exp(FORCE * rng.normal())
+    size = np.full(3, longer)
+    told = lambda pushes, force: tuple(stretched(one, size, force=force, time=1.0) for one in pushes)
+    there = lambda camera: replace(camera, world_to_camera=_moved_away(camera.world_to_camera, longer))
+    gaussians = twin.capture.gaussians
+    assert gaussians is not None
+    gaussians = replace(gaussians, mean=longer * gaussians.mean, log_scale=gaussians.log_scale + math.log(longer))
+    takes = tuple(
+        replace(take, cameras=tuple(map(there, take.cameras)), excitation=told(take.excitation or (), stronger))
+        for take in twin.capture.takes
+    )
+    given = replace(twin.given, boundaries=told(twin.given.boundaries, 1.0), dx=longer * twin.given.dx)
+    capture = replace(twin.capture, gaussians=gaussians, takes=takes)
+    return replace(twin, given=given, capture=capture, spacing=longer * twin.spacing)
+
+
+def _moved_away(pose: Tensor, longer: float) -> Tensor:
+    """A camera's [4, 4] in a world so many times as long."""
+    return pose * torch.tensor([1.0, 1.0, 1.0, longer], dtype=pose.dtype)
 
 
 def twin_source(built: Any, scene: str) -> CarnationTwin | MadeTwin:

@@ -30,7 +30,7 @@ MOST = 10  # fields that are added
 
 @dataclass(frozen=True, kw_only=True)
 class Swings:
-    """Modes of vibration at an amplitude at which all have one energy."""
+    """Modes of vibration at an amplitude at which all have one energy; none where the body takes part in none."""
 
     modes: np.ndarray  # [u, k], row 3 j + i: component i of function j [m]
     energy: float  # [J]
@@ -49,6 +49,8 @@ def swings(
     there = ((values @ fields).reshape(len(weight), 3, -1) ** 2).sum(1)
     part = (weight @ there) ** 2 / (weight.sum() * np.maximum(weight @ there**2, 1e-300))
     which = np.flatnonzero(part > PART)[:MODES]
+    if not which.size:  # loose bits alone swing: there is no mode of the body
+        return Swings(modes=shapes[:, which], energy=0.0)
     modes = shapes[:, which] / np.sqrt(square[which])
     slopes = (gradient @ modes.reshape(values.shape[1], -1)).reshape(len(weight), 9, len(which))
     largest = float(np.linalg.norm(slopes, axis=1).max(initial=0.0))

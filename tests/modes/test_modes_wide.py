@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import torch
 from modes_bodies import row, world
+from scipy import sparse
 
 from physics3d.filling.cells import solid_cells
 from physics3d.log import Log
@@ -71,6 +72,18 @@ def test_a_beam_that_bends_shortens_as_one_that_cannot_stretch():
     expected = -np.concatenate([[0.0], np.cumsum((slope**2).sum(1))[:-1]]) * edge - (slope**2).sum(1) * edge / 2
     found = (model.values @ psi)[:, 0]
     assert np.abs(found - expected).max() < 0.03 * np.abs(expected).max(), (x[-1], found[-1], expected[-1])
+
+
+def test_bits_that_swing_by_themselves_are_no_mode_of_the_body():
+    """A hundred equal bits, each of which swings alone: none is a fiftieth of the matter, so nothing is added; of
+    bits that swing together all are looked at."""
+    alone, together = np.eye(100)[:, :4], np.linalg.qr(np.random.default_rng(0).normal(size=(100, 4)))[0]
+    for scalars, modes in ((alone, 0), (together, 4)):
+        shapes = np.kron(scalars, np.array([[0.0], [0.0], [1.0]]))
+        one = sparse.identity(100, format="csr")
+        found = wide.swings(one, sparse.kron(one, np.ones((3, 1))).tocsr(), np.ones(100), shapes, np.ones(4))
+        assert found.modes.shape == (300, modes) and np.isfinite(found.energy)
+        assert (found.energy > 0) == (modes > 0)
 
 
 def test_a_coil_that_is_plucked_far_swings_as_finite_elements_say():
