@@ -1,6 +1,6 @@
 """Is what is learned the truth, and is it within its interval? Bodies with known material, over and over.
 
-    make bench-learning [ARGS="scenes=carnation,cup cameras=1,3 seeds=0,1 parts=bodies,told,shapes,handed,ways workers=2"]
+    make bench-learning [ARGS="scenes=carnation,cup cameras=1 seeds=0,1 parts=bodies,told,shapes,handed,ways workers=2"]
         ->   docs/results/learning.md, .csv, .png
     make bench-learning ARGS="cameras=3 parts=bodies"      the quick form: 20 minutes of processor time
 
