@@ -7,6 +7,7 @@ Built once, with the parameters that the world starts from; a learned material m
 """
 
 import functools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -42,6 +43,7 @@ MOST_GROUPS = 8  # materials that differ; more are a field
 APART = 1.25
 LOOKED_AT = 4
 ORDER = 2
+UNRESOLVED = math.log(10)  # of a body in loose bits: modes say nothing of its stiffness
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,15 +98,15 @@ class Model:
         )
 
     def too_stiff(self) -> float:
-        """How much stiffer the first modes are than those of the same body by splines as near as one likes, about, in
-        the mean over the energies that known loads give them: judged by coarser splines, for an error in the h-th
+        """How much stiffer (ln) the first modes are than those of the same body by splines as near as one likes, about,
+        in the mean over the energies that known loads give them: judged by coarser splines, for an error in the h-th
         power of their distance is 1/(APART^h - 1) of what the two differ by. Takes a few seconds."""
         held = any(spring.pull is None for spring in self.springs)
         which = slice(0 if held else 6, LOOKED_AT if held else 6 + LOOKED_AT)  # no rigid motion of a free body
-        here, there = self.exact_omega[which], self.coarser().exact_omega[which]
-        if len(here) != len(there) or not here.size:  # of a few splines
+        here, there = (np.maximum(one.exact_omega[which], 1e-30) for one in (self, self.coarser()))
+        if not len(here) == len(there) == len(self.shapes[which]) or not here.size:  # of a few splines
             return 0.0
-        error = np.abs(np.square(there / here) - 1) / (APART**ORDER - 1)
+        error = np.minimum(2 * np.abs(np.log(there / here)) / (APART**ORDER - 1), UNRESOLVED)
         pushes = [load.acceleration.double().numpy() for load in self.conditions.loads]
         work = [np.einsum("mri,r,i->m", self.shapes[which], f, a) for f, a in zip(self.load_fields, pushes)]
         energy = np.square(work).sum(0) / np.square(here) if work else np.zeros(len(here))
@@ -286,7 +288,8 @@ def model(
     K = vibration.stiffness(slopes_there, tangent[:, which] * factor[:, None, None])
     K += in_basis(permanent)
     lowest, shapes = vibration.dense_modes(K, np.kron(mass, np.eye(3)), len(exact), shift=shift)
-    off = np.abs(np.sqrt(np.maximum(lowest[swings] / exact[swings], 0))[:4] - 1)
+    both = np.flatnonzero(swings[: len(lowest)])[:4]  # the basis of a few loose bits has fewer modes than the splines
+    off = np.abs(np.sqrt(np.maximum(lowest[both] / exact[both], 0)) - 1)
     log.info(
         f"basis of {C.shape[1]} fields, integrated at {len(which)} points: its first frequencies are within "
         f"{100 * off.max(initial=0):.2g} % of those of the splines"

@@ -1,13 +1,17 @@
 """Wide swings: against a closed form, the sum over all points of integration, and another library's finite elements."""
 
+import math
 from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
+import pytest
 import torch
 from modes_bodies import row, world
 from scipy import sparse
 
+from physics3d.boundaries.fixed_region import FixedRegion
+from physics3d.boundaries.impulse import Impulse
 from physics3d.filling.cells import solid_cells
 from physics3d.log import Log
 from physics3d.matter import Matter
@@ -84,6 +88,26 @@ def test_bits_that_swing_by_themselves_are_no_mode_of_the_body():
         found = wide.swings(one, sparse.kron(one, np.ones((3, 1))).tocsr(), np.ones(100), shapes, np.ones(4))
         assert found.modes.shape == (300, modes) and np.isfinite(found.energy)
         assert (found.energy > 0) == (modes > 0)
+
+
+@pytest.mark.parametrize("held", [False, True])
+@pytest.mark.parametrize("seed", range(6))
+def test_a_body_in_loose_bits_moves_and_claims_no_more_than_it_can(seed, held):
+    """Pieces that touch nowhere, at random places: fewer fields than modes, modes in which next to nothing swings."""
+    rng = np.random.default_rng(seed)
+    scattered = (
+        rng.normal(size=(rng.integers(2, 50), 3)) * 0.05,
+        rng.integers(0, 6, size=(rng.integers(2, 50), 3)) * 0.01,
+    )
+    position = torch.from_numpy(np.unique(scattered[seed % 2], axis=0))
+    hold = FixedRegion(lower=(-1.0, -1.0, -1.0), upper=(0.015, 1.0, 1.0))
+    where = tuple(map(float, position[-1]))
+    poke = Impulse(force=(0.0, 1e-3, 0.0), centre=where, radius=0.02, duration=0.05)
+    there = world(2e5, 0.3, boundaries=(hold,) if held else (), dx=0.02)
+    solver = Solver.of(there, position, torch.full((len(position),), 1e-6), excitation=(poke,), log=Log(None))
+    run = solver.rollout(there.estimate().parameters, frames=3, frame_dt=0.02, log=Log(None))
+    assert bool(run.position.isfinite().all())
+    assert 0 <= solver.model.too_stiff() <= math.log(10) + 1e-9
 
 
 def test_a_coil_that_is_plucked_far_swings_as_finite_elements_say():
