@@ -35,6 +35,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from physics3d.cores import usable
+from physics3d.log import Log
 from pipeline.__main__ import quiet, title
 from pipeline.flow import Plan, before, built, first, idle, plan, suit, up_to_date
 from pipeline.hired import end_within
@@ -135,7 +136,8 @@ def asked(words: list[str]) -> tuple[Crew, list[Variant]]:
     if not lists["scenes"]:
         raise SettingsError("scenes is empty; say SCENES=carnation,ball (scenes=carnation,ball)")
     variants = []
-    for scene, method, seed in itertools.product(*(lists[key] or [""] for key in OWN[:3])):
+    combinations = list(itertools.product(*(lists[key] or [""] for key in OWN[:3])))
+    for scene, method, seed in Log(Path(), name="sweep").progress(combinations, "settings"):  # a second each
         said = [f"{k}={v}" for k, v in (("scene", scene), ("method", method), ("seed", seed)) if v]
         config, picked = compose(literal_paths([*said, *rest]))
         name, tags = title(picked, config, rest)
