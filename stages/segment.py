@@ -68,7 +68,7 @@ class Segment:
         gaussians = gaussians.to(self.device)
 
         if capture.images:
-            said, rooms = self._prompted(capture, gaussians, parts)
+            said, rooms = self._prompted(capture, gaussians, parts, log)
             every = self._views(capture, gaussians, said, rooms, log)
             views, maps = self._maps(capture, gaussians, every, parts, said, rooms, log)
             label = self._lift(gaussians, views, maps, parts, rooms)
@@ -108,7 +108,7 @@ class Segment:
         return Segmentation(label=label, parts=parts, masks=masks, mask_views=tuple(v.index for v in views))
 
     def _prompted(
-        self, capture: Capture, gaussians: Gaussians, parts: tuple[str, ...]
+        self, capture: Capture, gaussians: Gaussians, parts: tuple[str, ...], log: Log
     ) -> tuple[dict[str, tuple[View, np.ndarray]], dict[str, Room]]:
         """For each part that is prompted in an image: that view with its mask, and the space that the part may take."""
         said: dict[str, tuple[View, np.ndarray]] = {}
@@ -129,6 +129,8 @@ class Segment:
             part: Room.around(view, mask, tuple(p for p in self.prompts if p.part == part))
             for part, (view, mask) in said.items()
         }
+        for part, (view, _) in said.items():
+            log.info(f"{part}: prompted in {capture.names[view.index]}")
         return said, rooms
 
     def _maps(

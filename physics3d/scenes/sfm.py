@@ -108,10 +108,17 @@ def solve(
             f"the camera must move: one that stands still, turns or zooms explains {100 * standing:.0f} % of what the "
             f"{len(names)} pictures have in common, so they say nothing of depth; walk around the thing"
         )
-    model, angle = _placed(
-        pycolmap, database, images, folder / "models", [*names, *stills], seed, log, needed=set(stills)
-    )
-    have = {i.name for i in model.images.values() if i.has_pose} if model else set()
+    every, compared = [*names, *stills], set(pairs(names, ordered=ordered))
+    model, angle = _placed(pycolmap, database, images, folder / "models", every, seed, log, needed=set(stills))
+    have = _have(model)
+    lost = [name for name in names if name not in have]
+    left = [pair for pair in pairs(names, ordered=False) if set(pair) & set(lost) and pair not in compared]
+    if left and len(names) <= MOST_EXHAUSTIVE:  # where a video comes by again its neighbours are not those in time
+        log.info(f"{len(lost)} photographs are not placed: comparing them with all others")
+        _match(pycolmap, database, folder / "pairs.txt", left, seed=seed, log=log)
+        other, its_angle = _placed(pycolmap, database, images, folder / "again", every, seed, log, needed=set(stills))
+        if other is not None and (model is None or _worth(other, set(stills)) > _worth(model, set(stills))):
+            model, angle, have = other, its_angle, _have(other)
     placed, lost = tuple(n for n in names if n in have), tuple(n for n in names if n not in have)
     if model is None or not _enough(len(placed), len(names)):
         raise ValueError(
@@ -304,12 +311,16 @@ def _placed(
     return best, its_angle
 
 
+def _have(model) -> set[str]:
+    """The pictures that have a camera; of no model none."""
+    return {image.name for image in model.images.values() if image.has_pose} if model else set()
+
+
 def _worth(model, needed: Collection[str]) -> tuple[int, int]:
     """How many of the pictures `needed` it has placed, and how many in all."""
     if not needed:
         return 0, model.num_reg_images()
-    have = {image.name for image in model.images.values() if image.has_pose}
-    return len(have & set(needed)), model.num_reg_images()
+    return len(_have(model) & set(needed)), model.num_reg_images()
 
 
 def _enough(placed: int, of: int) -> bool:

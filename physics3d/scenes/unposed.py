@@ -111,6 +111,8 @@ def report(solved: Solved, camera_distance: float, log) -> None:
     log.metric("camera_span_deg", solved.span)
     if solved.lost:
         log.warn(f"not placed, left out: {', '.join(solved.lost[:12])}{', ...' if len(solved.lost) > 12 else ''}")
+        if min(solved.lost) < solved.placed[0]:
+            log.warn(f"photograph 0 is {solved.placed[0]} now: a prompt in `view: 0` is of that one")
     if solved.span < NARROW:
         log.warn(
             f"the cameras span only {solved.span:.0f} degrees around what they look at: depth is uncertain, and "

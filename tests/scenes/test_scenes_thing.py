@@ -16,6 +16,7 @@ from torch import Tensor
 
 from physics3d.log import Log
 from physics3d.motion.decay import Decay
+from physics3d.scenes import sfm
 from physics3d.scenes.base import Capture, Take
 from physics3d.scenes.carnation import TARGET
 from physics3d.scenes.clips import FilmedTake
@@ -113,6 +114,20 @@ def test_the_same_files_give_the_same_cameras_to_the_last_bit(handed, tmp_path):
         assert (a.fx, a.fy, a.cx, a.cy) == (b.fx, b.fy, b.cx, b.cy)
         assert torch.equal(a.world_to_camera, b.world_to_camera)
     assert torch.equal(one.points, other.points)
+
+
+def test_a_walk_that_comes_by_again_is_joined_where_it_does(handed, tmp_path, monkeypatch):
+    """Of a video each frame is compared with those that follow. The first one here looks from the side to which the
+    walk comes back last, 50 degrees from the next."""
+    pytest.importorskip("pycolmap", reason="pycolmap, the extra 'sfm', is not installed")
+    monkeypatch.setattr(sfm, "NEIGHBOURS", 1)  # of nine frames, as ten are of sixty
+    images = tmp_path / "images"
+    images.mkdir()
+    for number, view in enumerate((0, 5, 6, 7, 8, 4, 3, 2, 1)):
+        shutil.copy(handed / "thing" / f"IMG_{view + 1:04d}.jpg", images / f"frame_{number}.jpg")
+    solved = sfm.solve(images, tmp_path, ordered=True, camera_distance=0.5, seed=0, log=Log(tmp_path, quiet=True))
+    assert solved.lost == () and len(solved.placed) == VIEWS
+    assert "photographs are not placed: comparing them with all others" in (tmp_path / "log.txt").read_text()
 
 
 def test_cameras_of_the_clips_are_found_among_those_of_the_photographs(handed, tmp_path):
