@@ -1,6 +1,7 @@
 """Structure from motion: photographs without cameras -> cameras, lens and points, by COLMAP.
 
     match SIFT features over all pairs (of a video: over neighbours), place one photograph after the other, adjust all
+    (of a video: what is not placed is compared with all, and all placed once more)
 
 COLMAP begins with two photographs whose directions to the same points differ by `FIRST_ANGLES`: many where the
 photographer walked around, few where all look the same way, so that smaller angles are tried before giving up.
@@ -22,6 +23,7 @@ import sqlite3
 import threading
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -112,8 +114,8 @@ def solve(
     model, angle = _placed(pycolmap, database, images, folder / "models", every, seed, log, needed=set(stills))
     have = _have(model)
     lost = [name for name in names if name not in have]
-    left = [pair for pair in pairs(names, ordered=False) if set(pair) & set(lost) and pair not in compared]
-    if left and len(names) <= MOST_EXHAUSTIVE:  # where a video comes by again its neighbours are not those in time
+    left = [pair for pair in combinations(names, 2) if set(pair) & set(lost) and pair not in compared]
+    if 0 < len(left) <= MOST_EXHAUSTIVE**2 / 2:  # where a walk comes by again, neighbours are not those in time
         log.info(f"{len(lost)} photographs are not placed: comparing them with all others")
         _match(pycolmap, database, folder / "pairs.txt", left, seed=seed, log=log)
         other, its_angle = _placed(pycolmap, database, images, folder / "again", every, seed, log, needed=set(stills))
