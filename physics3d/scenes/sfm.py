@@ -113,10 +113,10 @@ def solve(
     every, compared = [*names, *stills], set(pairs(names, ordered=ordered))
     model, angle = _placed(pycolmap, database, images, folder / "models", every, seed, log, needed=set(stills))
     have = _have(model)
-    lost = [name for name in names if name not in have]
-    left = [pair for pair in combinations(names, 2) if set(pair) & set(lost) and pair not in compared]
+    unplaced = {name for name in names if name not in have}
+    left = [pair for pair in combinations(names, 2) if set(pair) & unplaced and pair not in compared]
     if 0 < len(left) <= MOST_EXHAUSTIVE**2 / 2:  # where a walk comes by again, neighbours are not those in time
-        log.info(f"{len(lost)} photographs are not placed: comparing them with all others")
+        log.info(f"{len(unplaced)} photographs are not placed: comparing them with all others")
         _match(pycolmap, database, folder / "pairs.txt", left, seed=seed, log=log)
         other, its_angle = _placed(pycolmap, database, images, folder / "again", every, seed, log, needed=set(stills))
         if other is not None and (model is None or _worth(other, set(stills)) > _worth(model, set(stills))):
