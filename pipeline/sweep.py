@@ -137,7 +137,8 @@ def asked(words: list[str]) -> tuple[Crew, list[Variant]]:
         raise SettingsError("scenes is empty; say SCENES=carnation,ball (scenes=carnation,ball)")
     variants = []
     combinations = list(itertools.product(*(lists[key] or [""] for key in OWN[:3])))
-    for scene, method, seed in Log(Path(), name="sweep").progress(combinations, "settings"):  # a second each
+    # a second each; nothing is written
+    for scene, method, seed in Log(Path(), name="sweep").progress(combinations, "settings"):
         said = [f"{k}={v}" for k, v in (("scene", scene), ("method", method), ("seed", seed)) if v]
         config, picked = compose(literal_paths([*said, *rest]))
         name, tags = title(picked, config, rest)

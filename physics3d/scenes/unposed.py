@@ -9,7 +9,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Annotated
 
 import numpy as np
@@ -110,9 +110,10 @@ def report(solved: Solved, camera_distance: float, log) -> None:
     log.metric("reprojection_error_px", solved.error)
     log.metric("camera_span_deg", solved.span)
     if solved.lost:
-        log.warn(f"not placed, left out: {', '.join(solved.lost[:12])}{', ...' if len(solved.lost) > 12 else ''}")
-        if min(solved.lost) < solved.placed[0]:
-            log.warn(f"photograph 0 is {solved.placed[0]} now: a prompt in `view: 0` is of that one")
+        lost, first = [PurePath(name).name for name in solved.lost], PurePath(solved.placed[0]).name
+        log.warn(f"not placed, left out: {', '.join(lost[:12])}{', ...' if len(lost) > 12 else ''}")
+        if min(lost) < first:
+            log.warn(f"photograph 0 is {first} now: a prompt in `view: 0` is of that one")
     if solved.span < NARROW:
         log.warn(
             f"the cameras span only {solved.span:.0f} degrees around what they look at: depth is uncertain, and "

@@ -13,9 +13,9 @@ from physics3d.log import Log
 from physics3d.scenes.frames import sharpest_frames
 from physics3d.scenes.ground import floor_plane, level, nearest_to_axes
 from physics3d.scenes.parallax import explained
-from physics3d.scenes.sfm import pairs
+from physics3d.scenes.sfm import Solved, pairs
 from physics3d.scenes.transforms import TransformsSource
-from physics3d.scenes.unposed import UnposedSource, _copies, photographs_below
+from physics3d.scenes.unposed import UnposedSource, _copies, photographs_below, report
 from physics3d.video import read_mp4
 
 UP = np.array([0.3, -0.8, 0.2]) / np.linalg.norm([0.3, -0.8, 0.2])
@@ -412,3 +412,14 @@ def test_cameras_of_real_photographs_are_found_again(data, tmp_path):
     assert angle.max() < 2 and centre.max() < 0.03
     # upright and to scale: cameras are above what they look at, and half a metre away in the middle
     assert (a[:, 2] > 0).all()
+
+
+@pytest.mark.parametrize("lost, said", [("frame_0.jpg", True), ("frame_2.jpg", False)])
+def test_that_numbers_of_photographs_have_moved_is_said(lost, said, tmp_path):
+    """Who prompts in `view: 0` means the first that was handed over."""
+    placed = tuple(f"photographs/frame_{i}.jpg" for i in range(3) if f"frame_{i}.jpg" != lost)
+    solved = Solved(folder=tmp_path, placed=placed, lost=(f"photographs/{lost}",), error=0.5, span=90.0, floor=True)
+    report(solved, 0.5, Log(tmp_path, quiet=True))
+    lines = (tmp_path / "log.txt").read_text()
+    assert f"left out: {lost}" in lines
+    assert ("photograph 0 is frame_1.jpg now" in lines) == said
